@@ -1,0 +1,55 @@
+"""What commands share when they talk to a person: tables, progress, JSON, and options' types.
+
+Standard output carries results; progress and remarks go to standard error, so that ``--json`` prints one object and
+nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+class Advance(Protocol):
+    """Tells that work went on: ``advance()`` after each step."""
+
+    def __call__(self, steps: int = 1) -> None: ...
+
+
+def out() -> Console:
+    """Standard output for people: colour on a terminal, plain text elsewhere."""
+    from rich.console import Console
+
+    return Console(highlight=False)
+
+
+def err() -> Console:
+    """Standard error, for progress and remarks."""
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)
+
+
+def print_json(value: Mapping[str, Any]) -> None:
+    """One JSON object on standard output. NaN and infinity are refused, as JSON has neither."""
+    print(json.dumps(value, allow_nan=False, indent=2))
+
+
+@contextmanager
+def progress(text: str, total: int | None, *, quiet: bool = False) -> Iterator[Advance]:
+    """A progress bar with the time left on standard error while the block runs; none where nobody watches."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda steps=1: None
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err(), transient=True) as bar:
+        task = bar.add_task(text, total=total)
+        yield lambda steps=1: bar.advance(task, steps)

@@ -1,0 +1,71 @@
+"""The entry point: the table of commands, and the one place where errors become messages and exit statuses."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from cyclopts import App, CycloptsError
+
+from lidarpose import __version__
+from lidarpose.errors import InputError, LidarposeError
+
+EXIT_DONE = 0
+EXIT_UNDETERMINED = 1
+EXIT_WRONG_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+# Commands are named as text, so that `lidarpose --help` imports none of them.
+_COMMANDS: dict[str, tuple[str, str]] = {}
+_GROUPS: dict[str, tuple[str, dict[str, tuple[str, str]]]] = {}
+
+
+def build_app() -> App:
+    """The whole command line as a cyclopts application."""
+    app = App(
+        name="lidarpose",
+        version=__version__,
+        help="Find where a LiDAR is, how sure that is, and turn what it sees into metric 3D.",
+        help_epilogue=(
+            "Exit status: 0 done; 1 the data do not determine what was asked; 2 wrong usage or unreadable input."
+        ),
+    )
+    for name, (target, text) in _COMMANDS.items():
+        app.command(target, name=name, help=text)
+    for name, (text, members) in _GROUPS.items():
+        group = App(name=name, help=text)
+        for member, (target, member_text) in members.items():
+            group.command(target, name=member, help=member_text)
+        app.command(group)
+    return app
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status; messages go to standard error."""
+    try:
+        build_app()(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+    except CycloptsError as error:
+        return _complain(str(error).strip() or "wrong usage", hint="See: lidarpose --help", status=EXIT_WRONG_INPUT)
+    except InputError as error:
+        return _complain(str(error), status=EXIT_WRONG_INPUT)
+    except LidarposeError as error:
+        return _complain(str(error), status=EXIT_UNDETERMINED)
+    except BrokenPipeError:
+        # The reader of our output went away (`lidarpose ... | head`); there is nobody left to tell.
+        sys.stderr.close()
+        return EXIT_DONE
+    except KeyboardInterrupt:
+        return _complain("interrupted; nothing half-written is left behind", status=EXIT_INTERRUPTED)
+    return EXIT_DONE
+
+
+def _complain(message: str, *, status: int, hint: str | None = None) -> int:
+    print(f"lidarpose: {message}", file=sys.stderr)
+    if hint:
+        print(hint, file=sys.stderr)
+    return status
+
+
+def main() -> None:
+    """Console script."""
+    sys.exit(run())

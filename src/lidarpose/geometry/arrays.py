@@ -1,0 +1,61 @@
+"""Array types shared by the whole package, and the few checks that everyone needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.floating[Any]]
+"""Floats, float64 wherever the package makes them."""
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+
+def as_float_array(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> FloatArray:
+    """Return `values` as a read-only float64 copy of the given shape (None: any length), or raise ValueError."""
+    array = np.array(values, dtype=np.float64)
+    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=False)):
+        wanted = "x".join("N" if n is None else str(n) for n in shape)
+        raise ValueError(f"{name} has shape {array.shape}, expected {wanted}")
+    array.setflags(write=False)
+    return array
+
+
+def unit(vectors: ArrayLike) -> FloatArray:
+    """Vectors (..., n) scaled to length 1; raises ValueError where one has no direction."""
+    array = np.asarray(vectors, dtype=np.float64)
+    length = np.linalg.norm(array, axis=-1, keepdims=True)
+    if not np.all(length > 0.0):
+        raise ValueError("a vector of length zero has no direction")
+    return np.asarray(array / length)
+
+
+def angle_between(a: ArrayLike, b: ArrayLike) -> Any:
+    """Angle in [0, pi] between vectors (..., 3), accurate near 0 and pi where arccos is not (Kahan)."""
+    a_unit, b_unit = unit(a), unit(b)
+    return 2.0 * np.arctan2(
+        np.linalg.norm(a_unit - b_unit, axis=-1),
+        np.linalg.norm(a_unit + b_unit, axis=-1),
+    )
+
+
+def wrap_angle(angle_rad: ArrayLike) -> Any:
+    """Angles folded into [-pi, pi)."""
+    return (np.asarray(angle_rad, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def perpendicular_pair(direction: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors u, v with (u, v, direction) right-handed; `direction` is (3,), need not be unit."""
+    w = unit(direction)
+    helper = np.zeros(3)
+    helper[int(np.argmin(np.abs(w)))] = 1.0
+    u = unit(np.cross(helper, w))
+    return u, np.cross(w, u)
+
+
+def all_finite(arrays: Iterable[ArrayLike]) -> bool:
+    """True if no array holds NaN or infinity."""
+    return all(bool(np.all(np.isfinite(np.asarray(a)))) for a in arrays)

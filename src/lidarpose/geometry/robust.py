@@ -1,0 +1,133 @@
+"""Robust statistics, and fits that tell their inliers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lidarpose.geometry.arrays import BoolArray, FloatArray
+
+# Makes the median absolute deviation of a normal distribution its standard deviation.
+MAD_TO_SIGMA = 1.4826022185056018
+
+
+def mad_sigma(values: ArrayLike, *, centred: bool = False) -> float:
+    """Robust standard deviation (median absolute deviation); with `centred`, about zero. NaN if empty."""
+    x = np.asarray(values, dtype=np.float64)
+    if x.size == 0:
+        return float("nan")
+    centre = 0.0 if centred else np.median(x)
+    return float(MAD_TO_SIGMA * np.median(np.abs(x - centre)))
+
+
+def huber_weights(standardised: ArrayLike, k: float = 1.345) -> FloatArray:
+    """Weights of Huber's loss for residuals in units of sigma; k = 1.345 keeps 95 % efficiency."""
+    r = np.abs(np.asarray(standardised, dtype=np.float64))
+    return np.asarray(np.where(r <= k, 1.0, k / np.maximum(r, k)))
+
+
+def tukey_weights(standardised: ArrayLike, k: float = 4.685) -> FloatArray:
+    """Weights of Tukey's biweight for residuals in units of sigma: zero beyond k; 4.685 keeps 95 % efficiency."""
+    r = np.asarray(standardised, dtype=np.float64) / k
+    return np.asarray(np.where(np.abs(r) < 1.0, (1.0 - r**2) ** 2, 0.0))
+
+
+def box_plot_inliers(values: ArrayLike, whisker: float = 1.5) -> BoolArray:
+    """Which values (N,) lie within Tukey's whiskers (quartiles widened by `whisker` interquartile ranges)."""
+    x = np.asarray(values, dtype=np.float64)
+    low, high = np.percentile(x, [25.0, 75.0])
+    reach = whisker * (high - low)
+    return np.asarray((x >= low - reach) & (x <= high + reach))
+
+
+class Residuals(Protocol):
+    """A model that tells signed or absolute distances of points."""
+
+    def distance(self, points: ArrayLike) -> FloatArray: ...
+
+
+M = TypeVar("M", bound=Residuals)
+
+
+@dataclass(frozen=True, eq=False)
+class RobustFit(Generic[M]):
+    """A model, which points (N,) support it, and their robust spread in the points' unit."""
+
+    model: M
+    inliers: BoolArray
+    sigma: float
+
+
+def ransac(
+    points: FloatArray,
+    fit: Callable[[FloatArray], M],
+    sample_size: int,
+    threshold: float,
+    *,
+    seed: int,
+    iterations: int = 500,
+) -> RobustFit[M]:
+    """Random sample consensus with a local optimisation: the model with most points within `threshold`.
+
+    Parameters
+    ----------
+    points : (N, d)
+    fit
+        Makes a model from at least `sample_size` points; may raise ValueError for degenerate samples.
+    threshold
+        In the points' unit.
+
+    Raises
+    ------
+    ValueError
+        If no sample gives a model.
+
+    Source: Fischler and Bolles (1981); the refit of each new best follows Chum, Matas and Kittler (2003).
+    """
+    rng = np.random.default_rng(seed)
+    best: tuple[int, M, BoolArray] | None = None
+    for _ in range(iterations):
+        try:
+            model = fit(points[rng.choice(len(points), sample_size, replace=False)])
+        except ValueError:
+            continue
+        inliers = np.abs(model.distance(points)) <= threshold
+        count = int(inliers.sum())
+        if best is None or count > best[0]:
+            best = _optimise_locally(points, fit, threshold, model, inliers, sample_size)
+            if best[0] == len(points):
+                break
+    if best is None:
+        raise ValueError("no sample of the points determines the model")
+    _, model, inliers = best
+    return RobustFit(model, inliers, mad_sigma(model.distance(points[inliers]), centred=True))
+
+
+def _optimise_locally(
+    points: FloatArray,
+    fit: Callable[[FloatArray], M],
+    threshold: float,
+    model: M,
+    inliers: BoolArray,
+    sample_size: int,
+) -> tuple[int, M, BoolArray]:
+    count = int(inliers.sum())
+    for _ in range(4):
+        if count < sample_size:
+            break
+        try:
+            refined = fit(points[inliers])
+        except ValueError:
+            break
+        again = np.abs(refined.distance(points)) <= threshold
+        if int(again.sum()) < count:
+            break
+        model, stable, inliers = refined, bool(np.array_equal(again, inliers)), again
+        count = int(inliers.sum())
+        if stable:
+            break
+    return count, model, inliers

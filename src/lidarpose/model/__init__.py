@@ -1,0 +1,1 @@
+"""The nouns: frozen, typed, and free of files, drawing and estimators."""

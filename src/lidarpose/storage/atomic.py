@@ -1,0 +1,78 @@
+"""Outputs that are whole or absent: written beside their place under another name, then renamed."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from lidarpose.errors import InputError
+
+# Left-overs of killed runs carry this mark and are cleaned by the next write of the same file.
+_MARK = ".lidarpose-part-"
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary path in the same folder; on success it takes the place of `path`, else it is removed.
+
+    The temporary name keeps the suffix, for writers that choose a format by it. The file is flushed to the disk
+    before the rename, so that a power cut leaves either the old file or the new one.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made or written to.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _clean_left_overs(path)
+        if path.is_dir():
+            raise InputError(path, "is a folder", expected="the name of a file to write")
+        temporary = path.with_name(f"{path.stem}{_MARK}{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+        try:
+            yield temporary
+            _flush_to_disk(temporary)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(path, f"cannot be written: {error.strerror or error}") from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a UTF-8 text file, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _flush_to_disk(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _clean_left_overs(path: Path) -> None:
+    for left in path.parent.glob(f"{_escape(path.stem)}{_MARK}*{_escape(path.suffix)}"):
+        process = left.name.split(_MARK, 1)[1].split("-", 1)[0]
+        if not (process.isdigit() and _is_alive(int(process))):
+            left.unlink(missing_ok=True)
+
+
+def _escape(text: str) -> str:
+    return "".join(f"[{c}]" if c in "*?[" else c for c in text)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
