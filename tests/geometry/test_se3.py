@@ -81,7 +81,7 @@ def test_covariances_of_composition_inverse_and_centre_agree_with_sampling() -> 
     uncertain = [UncertainPose(T, L @ L.T) for T, L in zip((A, B), roots, strict=True)]
     composed, inverse = uncertain[0] @ uncertain[1], uncertain[0].inverse()
     draws_ab, draws_inverse, draws_centre = [], [], []
-    for _ in range(20000):
+    for _ in range(6000):
         a = Pose.exp(roots[0] @ rng.normal(size=6)) @ A
         b = Pose.exp(roots[1] @ rng.normal(size=6)) @ B
         draws_ab.append((a @ b).minus(A @ B))
@@ -94,4 +94,4 @@ def test_covariances_of_composition_inverse_and_centre_agree_with_sampling() -> 
     ):
         sampled = np.cov(np.array(draws).T)
         scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
-        np.testing.assert_allclose(sampled / scale, predicted / scale, atol=0.04)
+        np.testing.assert_allclose(sampled / scale, predicted / scale, atol=0.07)

@@ -137,3 +137,17 @@ class TurntableObservations:
     places: tuple[PlaceObservation, ...]
     lidar: LidarSpec = field(default_factory=LidarSpec)
     left_out: tuple[LeftOut, ...] = ()
+
+
+@dataclass(frozen=True)
+class PlaceFeatures:
+    """What detection alone can tell of one stop: stripes by panel, and straight lines of the scan that nobody owns yet.
+
+    Which of the `lines` lies on which panel is decided afterwards, by evidence, from all places together.
+    """
+
+    position: str
+    turntable_angle_rad: float
+    stripes: Mapping[int, StripePoints]
+    lines: tuple[ScanLine, ...]
+    placement: str = DEFAULT_PLACEMENT
