@@ -16,7 +16,9 @@ EXIT_WRONG_INPUT = 2
 EXIT_INTERRUPTED = 130
 
 # Commands are named as text, so that `lidarpose --help` imports none of them.
-_COMMANDS: dict[str, tuple[str, str]] = {}
+_COMMANDS: dict[str, tuple[str, str]] = {
+    "pose": ("lidarpose.cli.pose:pose", "The LiDAR's pose at a turntable angle, with its standard deviations."),
+}
 _GROUPS: dict[str, tuple[str, dict[str, tuple[str, str]]]] = {}
 
 
