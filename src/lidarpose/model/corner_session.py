@@ -1,0 +1,88 @@
+"""Corner sessions as recorded: a target with three faces, moved from place to place without turning it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+from lidarpose.geometry.arrays import FloatArray, as_float_array
+from lidarpose.model.cloud import Cloud
+from lidarpose.model.scan import LidarSpec
+
+CloudFrame = Literal["lidar", "camera"]
+"""The frame of a session's clouds: "camera" for clouds assembled from a spun 2D LiDAR."""
+
+
+class CloudSource(Protocol):
+    """A cloud somewhere, read only when it is needed."""
+
+    @property
+    def name(self) -> str:
+        """What a person calls it: the path as the session's files write it."""
+        ...
+
+    def load(self) -> Cloud:
+        """Read it. Raises InputError if it is missing or unreadable."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class CornerPlace:
+    """One place of the target.
+
+    Attributes
+    ----------
+    position
+        Its name in the session.
+    corner_world : (3,)
+        The measured corner in the world frame, metres.
+    clouds
+        The frames recorded there.
+    near : (3,) or None
+        The corner's rough place in the clouds' frame, within `NEAR_RADIUS_M`, where the user gave it.
+    """
+
+    position: str
+    corner_world: FloatArray
+    clouds: tuple[CloudSource, ...]
+    near: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "corner_world", as_float_array(self.corner_world, (3,), "corner_world"))
+        if self.near is not None:
+            object.__setattr__(self, "near", as_float_array(self.near, (3,), "near"))
+
+
+NEAR_RADIUS_M = 0.3
+"""How far a `near` hint may be from the corner."""
+
+
+@dataclass(frozen=True)
+class CornerSession:
+    """A corner session: places with known world coordinates, and the frames recorded at each.
+
+    Attributes
+    ----------
+    world_sigma_m
+        How well each world coordinate was measured; None where the user does not say.
+    estimate_scale
+        Whether the user asks for the factor of eq. (2) of the corner paper as well.
+    """
+
+    name: str
+    places: tuple[CornerPlace, ...]
+    world_sigma_m: float | None = None
+    estimate_scale: bool = False
+    cloud_frame: CloudFrame = "lidar"
+    lidar: LidarSpec = field(default_factory=LidarSpec)
+
+
+@dataclass(frozen=True, eq=False)
+class MemoryCloud:
+    """A cloud source that is already in memory."""
+
+    name: str
+    cloud: Cloud
+
+    def load(self) -> Cloud:
+        return self.cloud
