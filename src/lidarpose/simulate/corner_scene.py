@@ -13,7 +13,7 @@ from lidarpose.geometry.se3 import Pose, exp_so3, rotation_z
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.corner_session import CornerPlace, CornerSession, MemoryCloud
 from lidarpose.model.scan import LidarSpec
-from lidarpose.simulate.multibeam import INSTRUMENTS, CastScene, ConvexSolid, Defects, cast_scene
+from lidarpose.simulate.multibeam import INSTRUMENTS, BeamTable, CastScene, ConvexSolid, Defects, cast_scene
 
 TargetKind = Literal["cube", "arrow", "oblique", "concave"]
 
@@ -65,7 +65,7 @@ class CornerTruth:
 
 @dataclass(frozen=True)
 class CornerSceneSpec:
-    """What to simulate. `pose` is one of `PAPER_POSES`, or a T_world_lidar of one's own with `target` and `ground_m`."""
+    """What to simulate: `pose` is one of `PAPER_POSES`, or T_world_lidar itself."""
 
     pose: str | Pose = "1"
     target: TargetKind | None = None
@@ -104,7 +104,7 @@ def make_target(kind: TargetKind, size_m: float, towards_rad: float, rng: np.ran
     half = np.sqrt(0.5)
     if kind == "cube":
         normals = np.array([[0.0, 0.0, 1.0], [half, half, 0.0], [half, -half, 0.0]])
-        normals = normals @ rotation_z(rng.uniform(-0.35, 0.35)).T
+        normals = normals @ rotation_z(rng.uniform(-0.2, 0.2)).T
         return _solid_target(kind, normals @ turn.T, size_m)
     if kind == "arrow":
         # The head of a block arrow pointing at the LiDAR: sides 80 degrees apart, the top sloping towards the tip.
@@ -114,7 +114,7 @@ def make_target(kind: TargetKind, size_m: float, towards_rad: float, rng: np.ran
     if kind == "oblique":
         normals = np.array([[0.2, 0.0, 1.0], [half, half, 0.1], [half, -half, 0.1]]) + rng.uniform(-0.15, 0.15, (3, 3))
         return _solid_target(kind, unit(normals) @ turn.T, size_m)
-    return _concave_target(size_m, turn @ rotation_z(rng.uniform(-0.35, 0.35)))
+    return _concave_target(size_m, turn @ rotation_z(rng.uniform(-0.2, 0.2)))
 
 
 def _solid_target(kind: TargetKind, normals: FloatArray, size_m: float) -> Target:
@@ -149,22 +149,44 @@ def _turned(target: Target, angle_rad: float) -> Target:
 
 
 def corner_places(
-    count: int, T_world_lidar: Pose, ground_m: float, bottom_m: float, rng: np.random.Generator
+    count: int, T_world_lidar: Pose, ground_m: float, target: Target, table: BeamTable, rng: np.random.Generator
 ) -> FloatArray:
-    """Corners (count, 3) in the world, well spread in front of the LiDAR, every second one raised on a stand."""
+    """Corners (count, 3) in the world, well spread in front of the LiDAR at about 2 m, some of them raised.
+
+    Places whose corner the instrument would see only at the edge of its field of view, or not at all, are drawn again.
+    """
     ahead = T_world_lidar.rotation[:, 0]
     heading = np.arctan2(ahead[1], ahead[0])
-    azimuth = heading + np.linspace(-0.55, 0.55, count)[rng.permutation(count)] + rng.uniform(-0.05, 0.05, count)
-    distance = np.where(np.arange(count) % 2 == 0, 1.8, 2.5) + rng.uniform(-0.15, 0.15, count)
-    stand = np.where(np.arange(count) % 3 == 1, 0.25, 0.0)
+    slots = np.linspace(-0.55, 0.55, count)[rng.permutation(count)]
+    return np.stack([_draw_place(heading, slot, T_world_lidar, ground_m, target, table, rng) for slot in slots])
+
+
+def _draw_place(
+    heading: float,
+    slot: float,
+    T_world_lidar: Pose,
+    ground_m: float,
+    target: Target,
+    table: BeamTable,
+    rng: np.random.Generator,
+) -> FloatArray:
+    sine = table.directions[:, 2]
+    lowest, highest = np.arcsin(sine.min()) + 0.03, np.arcsin(sine.max()) - 0.03
     centre = T_world_lidar.translation
-    return np.column_stack(
-        [
-            centre[0] + distance * np.cos(azimuth),
-            centre[1] + distance * np.sin(azimuth),
-            ground_m + bottom_m + stand,
-        ]
-    )
+    # The faces' middles, half a face away from the corner, have to be seen as well.
+    outward = 1.0 if target.kind == "concave" else -1.0
+    edges = outward * np.linalg.inv(unit(target.face_normals)).T * 0.25
+    around = np.vstack([np.zeros(3), edges])
+    for attempt in range(2000):
+        turn, distance = heading + slot * rng.uniform(0.4, 1.1), rng.uniform(1.4, 2.6 + attempt / 1000.0)
+        height = ground_m + target.bottom_m + float(rng.choice([0.0, 0.0, 0.15, 0.3]))
+        corner = np.array([centre[0] + distance * np.cos(turn), centre[1] + distance * np.sin(turn), height])
+        seen = T_world_lidar.inverse() @ (corner + around)
+        elevation = np.arcsin(seen[:, 2] / np.linalg.norm(seen, axis=1))
+        looks = ((centre - corner) @ target.face_normals.T) / np.linalg.norm(centre - corner)
+        if elevation.min() > lowest and elevation.max() < highest and looks.min() > 0.15:
+            return corner
+    raise ValueError("the instrument sees the whole target from no place near 2 m")
 
 
 def _surroundings(
@@ -177,8 +199,8 @@ def _surroundings(
         reach = rng.uniform(4.0, 6.0, 4)
         for k, (sign, axis) in enumerate([(1, 0), (-1, 0), (1, 1), (-1, 1)]):
             middle = centre + sign * (reach[k] + 0.1) * axes[:, axis]
-            size = [0.2, 14.0, 8.0] if axis == 0 else [14.0, 0.2, 8.0]
-            solids.append(upright_box([middle[0], middle[1], ground_m + 1.2], size, yaw))
+            wall = [0.2, 14.0, 8.0] if axis == 0 else [14.0, 0.2, 8.0]
+            solids.append(upright_box([middle[0], middle[1], ground_m + 1.2], wall, yaw))
         solids.append(upright_box([centre[0], centre[1], ground_m + 3.1], [16.0, 16.0, 0.2], yaw))
     while len(solids) < 1 + 5 * spec.room + spec.clutter:
         size = rng.uniform(0.2, 0.9, 3)
@@ -186,9 +208,7 @@ def _surroundings(
         spot = centre[:2] + distance * np.array([np.cos(azimuth), np.sin(azimuth)])
         if _hides_target(spot, float(np.hypot(size[0], size[1])) / 2.0, centre[:2], corners[:, :2]):
             continue
-        solids.append(
-            upright_box([spot[0], spot[1], ground_m + size[2] / 2.0], size, rng.uniform(0.0, np.pi / 2.0))
-        )
+        solids.append(upright_box([spot[0], spot[1], ground_m + size[2] / 2.0], size, rng.uniform(0.0, np.pi / 2.0)))
     return solids
 
 
@@ -224,9 +244,9 @@ def simulate_corner_session(spec: CornerSceneSpec) -> tuple[CornerSession, Corne
     T_world_lidar, kind, ground_m = _resolve(spec)
     ahead = T_world_lidar.rotation[:, 0]
     target = make_target(kind, spec.size_m, float(np.arctan2(ahead[1], ahead[0])) + np.pi, rng)
-    corners = corner_places(spec.places, T_world_lidar, ground_m, target.bottom_m, rng)
-    surroundings = _surroundings(spec, T_world_lidar.translation, ground_m, corners, rng)
     table = INSTRUMENTS[spec.lidar]()
+    corners = corner_places(spec.places, T_world_lidar, ground_m, target, table, rng)
+    surroundings = _surroundings(spec, T_world_lidar.translation, ground_m, corners, rng)
     to_lidar = T_world_lidar.inverse()
     places = []
     for i, corner in enumerate(corners):

@@ -61,9 +61,10 @@ def cayley_pose(world: ArrayLike, lidar: ArrayLike, *, iterations: int = 0, scal
     """
     w, p = np.asarray(world, dtype=np.float64), scale * np.asarray(lidar, dtype=np.float64)
     centred_w, centred_p = w - w.mean(axis=0), p - p.mean(axis=0)
-    best, best_cost = np.eye(3), np.inf
+    best: FloatArray = np.eye(3)
+    best_cost = np.inf
     for turn in _HELPING_TURNS:
-        R = turn
+        R: FloatArray = np.asarray(turn)
         for _ in range(iterations + 1):
             a, b, c = _cayley_parameters(w, p @ R.T)
             R = nearest_rotation(cayley_rotation(a, b, c) @ R)
