@@ -37,3 +37,10 @@ class Cloud:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def finite(self) -> Cloud:
+        """The points without those that have a NaN or infinite coordinate (beams without return); fields likewise."""
+        keep = np.isfinite(self.points).all(axis=1)
+        if keep.all():
+            return self
+        return Cloud(self.points[keep], {name: column[keep] for name, column in self.fields.items()}, self.frame)

@@ -1,0 +1,38 @@
+"""Text headers of clouds: read within bounds, and written at a fixed length so that counts can be mended at the end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lidarpose.errors import InputError
+from lidarpose.storage.limits import MAX_HEADER_BYTES, MAX_POINTS
+
+
+def read_header_lines(path: Path, last: str) -> tuple[list[str], int]:
+    """The header's lines up to the one whose first word is `last`, and the byte offset of what follows."""
+    with path.open("rb") as file:
+        head = file.read(MAX_HEADER_BYTES)
+    lines: list[str] = []
+    start = 0
+    while (end := head.find(b"\n", start)) >= 0:
+        line = head[start:end].decode("latin-1").strip()
+        lines.append(line)
+        start = end + 1
+        if line.split(maxsplit=1)[:1] == [last]:
+            return lines, start
+    raise InputError(path, f"has no line {last!r} within its first {MAX_HEADER_BYTES} bytes", expected="a whole header")
+
+
+def whole_number(path: Path, field: str, text: str, *, low: int = 0, high: int = MAX_POINTS) -> int:
+    """A count in a header as a number within bounds, else InputError."""
+    value = int(text) if text.isascii() and text.isdigit() and len(text) <= 20 else None
+    if value is None or not low <= value <= high:
+        raise InputError(path, f"is {text[:40]!r}", field=field, expected=f"a whole number from {low} to {high}")
+    return value
+
+
+def fill(lines: list[str], comment: str, length: int) -> bytes:
+    """The header `lines` with a comment put after the first, padded so that all is `length` bytes long."""
+    rest = sum(len(line) + 1 for line in lines) + len(comment) + 1
+    padded = comment + " " * (length - rest)
+    return ("\n".join([lines[0], padded, *lines[1:]]) + "\n").encode("ascii")

@@ -1,0 +1,92 @@
+"""NPY: an (N, 3) array of coordinates, or a structured array (N,) with fields x, y, z and others.
+
+A plain (N, k) array with k > 3 is read too; its further columns have no names and become ``column_4`` and so on.
+Pickled objects are never read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.lib import format as npy_format
+
+from lidarpose.errors import InputError
+from lidarpose.model.cloud import Cloud
+from lidarpose.storage.clouds.columns import Columns, cloud_of_rows, write_rows
+from lidarpose.storage.limits import file_size, require_bytes, require_count
+
+
+def read(path: Path) -> Cloud:
+    """Read a cloud from an NPY file."""
+    shape, dtype = _read_header(path)
+    array = np.load(path, allow_pickle=False)
+    if dtype.names is not None and len(shape) == 1:
+        return cloud_of_rows(array, path)
+    if dtype.names is None and dtype.kind in "fiu" and len(shape) == 2 and shape[1] >= 3:
+        kept = np.float32 if dtype.kind == "f" and dtype.itemsize == 4 else np.float64
+        fields = {f"column_{k + 1}": np.ascontiguousarray(array[:, k]) for k in range(3, shape[1])}
+        return Cloud(np.ascontiguousarray(array[:, :3], dtype=kept), fields)
+    raise InputError(
+        path, f"holds an array {shape} of {dtype}", expected="(N, 3) numbers, or (N,) rows with fields x, y, z"
+    )
+
+
+def _read_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type, after comparing them with the file's size."""
+    with path.open("rb") as file:
+        try:
+            version = npy_format.read_magic(file)
+            reader = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
+            if version not in ((1, 0), (2, 0)):
+                raise ValueError(f"version {version}")
+            shape, _, dtype = reader(file)
+        except (ValueError, TypeError, SyntaxError, KeyError, RecursionError, EOFError) as error:
+            problem = str(error).splitlines()[0] if str(error) else "its header is damaged"
+            raise InputError(path, f"is no NPY file: {problem}", expected="an array saved by numpy.save") from error
+        offset = file.tell()
+    if dtype.hasobject:
+        raise InputError(path, "holds Python objects", expected="an array of numbers")
+    count = 1
+    for extent in shape:
+        count *= require_count(path, "shape", extent)
+    needed = count * dtype.itemsize
+    require_bytes(path, "shape", needed, file_size(path) - offset)
+    if needed != file_size(path) - offset:
+        raise InputError(path, "has more bytes than its array takes", field="shape", expected="one array alone")
+    return tuple(shape), dtype
+
+
+@contextmanager
+def writer(path: Path, columns: Columns, shown: Path) -> Iterator[_Writer]:
+    """Write an NPY file; the number of points is put into the header at the end."""
+    with path.open("wb") as file:
+        out = _Writer(file, columns)
+        yield out
+        out.finish()
+
+
+class _Writer:
+    def __init__(self, file: IO[bytes], columns: Columns) -> None:
+        self._file, self._columns, self._count = file, columns, 0
+        self._put_header()
+
+    def append(self, cloud: Cloud) -> None:
+        """Write the points of `cloud` after those before."""
+        write_rows(self._file, self._columns, cloud)
+        self._count += len(cloud)
+
+    def finish(self) -> None:
+        # numpy pads its header so that the first extent can grow without changing the length.
+        self._file.seek(0)
+        self._put_header()
+
+    def _put_header(self) -> None:
+        plain = not self._columns.fields
+        dtype = self._columns.xyz.newbyteorder("<") if plain else self._columns.row()
+        shape = (self._count, 3) if plain else (self._count,)
+        header = {"descr": npy_format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+        npy_format.write_array_header_1_0(self._file, header)
