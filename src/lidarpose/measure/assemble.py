@@ -5,7 +5,8 @@ A beam of range rho at angle theta, seen at the turntable's reading psi, is the 
 coordinate; for a reading a beam, a turn about z and one 3x3 map.
 
 Two ways give the same numbers: NumPy in blocks that fit the cache, and kernels compiled by numba (the `fast` extra),
-which pay from some ten million points on because importing them costs more than assembling fewer. Both run on all cores.
+which pay from some ten million points on, because importing them costs more than assembling fewer. Both run on all
+cores.
 """
 
 from __future__ import annotations
@@ -45,9 +46,7 @@ def sweep_poses(motion: TurntableMotion, turntable_angle_rad: FloatArray) -> Swe
     return SweepPoses(np.asarray(R_camera @ R_tl), np.asarray(R_camera @ t_tl + t_ct))
 
 
-def beam_origins_and_directions(
-    motion: TurntableMotion, recording: SweepRecording
-) -> tuple[FloatArray, FloatArray]:
+def beam_origins_and_directions(motion: TurntableMotion, recording: SweepRecording) -> tuple[FloatArray, FloatArray]:
     """Where beams start (N, 3) or (N, M, 3), and their unit directions (N, M, 3), in the camera frame."""
     theta = recording.beam_angle_rad
     d_lidar = np.stack([np.cos(theta), np.sin(theta), np.zeros_like(theta)], -1)
@@ -100,12 +99,33 @@ def assemble(
     return points
 
 
+def readings_between(recording: SweepRecording, first: int = 0, last: int | None = None) -> FloatArray:
+    """Readings (last - first, M) in degrees of a turntable that turned on during the sweeps, by interpolation in time.
+
+    `time_s` is taken as the time of each sweep's first beam, and the mirror as turning once a sweep: the beam at the
+    angle a behind the first one is a / 360 degrees of a period later.
+    """
+    if recording.time_s is None:
+        raise ValueError("the recording has no times")
+    time = np.asarray(recording.time_s, dtype=np.float64)
+    beam = np.asarray(recording.beam_angle_deg, dtype=np.float64)
+    period = float(np.median(np.diff(time)))
+    beam_time = time[first:last, None] + np.abs(beam - beam[0]) / 360.0 * period
+    reading = np.asarray(recording.turntable_angle_deg, dtype=np.float64)
+    # One more sweep at the end, for the beams after the last reading.
+    time = np.append(time, time[-1] + period)
+    reading = np.append(reading, 2.0 * reading[-1] - reading[-2])
+    return np.asarray(np.interp(beam_time, time, reading))
+
+
 def has_compiler() -> bool:
     """True if numba is installed."""
     return find_spec("numba") is not None
 
 
-def compact(points: NDArray[Any], keep: BoolArray, columns: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], dict[str, Any]]:
+def compact(
+    points: NDArray[Any], keep: BoolArray, columns: dict[str, NDArray[Any]]
+) -> tuple[NDArray[Any], dict[str, Any]]:
     """Points (K, 3) and columns (K,) of the beams (N, M) to keep, in the order of the recording."""
     flat = keep.ravel()
     if flat.all():

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import mmap
-import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.lib import format as npy
@@ -14,6 +13,8 @@ from lidarpose.errors import InputError
 from lidarpose.model.recording import RealArray, SweepRecording
 from lidarpose.model.scan import LidarSpec
 from lidarpose.storage.atomic import replacing, write_text
+from lidarpose.storage.documents import Schema, check_format, parse, read_toml
+from lidarpose.storage.session import LidarSection
 
 FORMAT = "lidarpose/sweep-recording@1"
 HEAD = "recording.toml"
@@ -21,6 +22,11 @@ HEAD = "recording.toml"
 # Readings of a turntable and beam angles beyond these are no degrees, ranges beyond no metres of any LiDAR.
 _LARGEST_ANGLE_DEG = 3.6e5
 _LARGEST_RANGE_M = 2000.0
+
+
+class _HeadFile(Schema):
+    format: Literal["lidarpose/sweep-recording@1"]
+    lidar: LidarSection = LidarSection()
 
 
 def is_recording(path: Path) -> bool:
@@ -107,47 +113,18 @@ def _head_text(lidar: LidarSpec) -> str:
 
 
 def _read_head(path: Path) -> LidarSpec:
-    try:
-        if path.stat().st_size > 1 << 20:
-            raise InputError(path, "is far too large for a head file", expected="a few lines of TOML")
-        head = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(path, "is missing", expected=f'a file with format = "{FORMAT}"') from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(path, f"is not valid TOML: {error}") from error
-    found = head.get("format")
-    if found != FORMAT:
-        raise InputError(path, f"is {found!r}", field="format", expected=f'"{FORMAT}"')
-    for key in head.keys() - {"format", "lidar"}:
-        raise InputError(path, "is not known here", field=key, expected="format and [lidar]")
-    return _lidar_spec(path, head.get("lidar", {}))
-
-
-def _lidar_spec(path: Path, table: Any) -> LidarSpec:
-    if not isinstance(table, dict):
-        raise InputError(path, "is not a table", field="lidar", expected="[lidar]")
-    for key in table.keys() - {"model", "range_sigma_m"}:
-        raise InputError(path, "is not known here", field=f"lidar.{key}", expected="model and range_sigma_m")
-    model, sigma = table.get("model"), table.get("range_sigma_m")
-    if model is not None and not isinstance(model, str):
-        raise InputError(path, f"is {model!r}", field="lidar.model", expected="a text")
-    if sigma is not None and (
-        isinstance(sigma, bool) or not isinstance(sigma, int | float) or not 0.0 < float(sigma) < 10.0
-    ):
-        raise InputError(path, f"is {sigma!r}", field="lidar.range_sigma_m", expected="metres, above 0 and below 10")
-    return LidarSpec(model, None if sigma is None else float(sigma))
+    document = check_format(path, read_toml(path), FORMAT)
+    return parse(path, _HeadFile, document).lidar.spec()
 
 
 def _map_array(path: Path, *, required: bool) -> RealArray | None:
     try:
         with path.open("rb") as file:
-            version = npy.read_magic(file)  # type: ignore[no-untyped-call]
+            version = npy.read_magic(file)
             read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
             if read is None:
                 raise InputError(path, f"is an .npy file of version {version}", expected="version 1.0 or 2.0")
-            shape, fortran, dtype = read(file)  # type: ignore[no-untyped-call]
+            shape, fortran, dtype = read(file)
             start = file.tell()
     except FileNotFoundError as error:
         if not required:
@@ -192,7 +169,9 @@ def _join(folder: Path, lidar: LidarSpec, arrays: dict[str, RealArray | None]) -
             folder / "range_m.npy", f"holds {ranges.dtype}", expected="float32 metres, NaN where there is no return"
         )
     try:
-        return SweepRecording(folder.name or str(folder), readings, beams, ranges, arrays["intensity"], arrays["time_s"], lidar)
+        return SweepRecording(
+            folder.name or str(folder), readings, beams, ranges, arrays["intensity"], arrays["time_s"], lidar
+        )
     except ValueError as error:
         raise InputError(folder, str(error)) from error
 
@@ -224,7 +203,7 @@ def _check_times(path: Path, array: RealArray | None) -> None:
 
 
 def _check_ranges(path: Path, array: RealArray) -> None:
-    """Refuse millimetres taken for metres, from a sample of sweeps: one pass over a file larger than memory is enough."""
+    """Refuse millimetres taken for metres, from a sample of the sweeps."""
     step = max(1, len(array) * array.shape[1] // (1 << 20))
     sample = np.asarray(array[::step], dtype=np.float64)
     valid = sample[(sample > 0.0) & np.isfinite(sample)]
