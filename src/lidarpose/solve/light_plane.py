@@ -1,0 +1,219 @@
+"""The laser's plane and its two stripes in the camera frame (turntable paper, section 1.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, angle_between, unit
+from lidarpose.geometry.planes import Plane, fit_plane, intersect_three_planes
+from lidarpose.geometry.robust import mad_sigma, tukey_weights
+from lidarpose.geometry.se3 import Pose
+from lidarpose.model.camera import Camera
+from lidarpose.model.observation import StripePoints
+
+HYPOTHESES = 200
+# Points at which hypotheses are scored; the fit itself uses all of them.
+SCORED_POINTS = 200
+
+
+@dataclass(frozen=True, eq=False)
+class StripeOnPanel:
+    """A stripe's points where the panel's plane holds them.
+
+    Attributes
+    ----------
+    points_camera : (N, 3)
+    spread_camera : (N, 3)
+        How far each point moves for one standard deviation of its pixel.
+    """
+
+    points_camera: FloatArray
+    spread_camera: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class LightPlane:
+    """The light plane, and how well it is known.
+
+    Attributes
+    ----------
+    plane
+        In the camera frame; the sign of its normal is arbitrary.
+    covariance : (3, 3)
+        Of (turn about `u`, turn about `v`, offset), see `basis`; about `pivot`.
+    basis : (2, 3)
+        Unit vectors u, v in the plane: a small change turns the normal by ``a * u + b * v``.
+    pivot : (3,)
+        The weighted middle of the points: the offset's change is that of the distance there.
+    inliers
+        By stripe, which points support the plane.
+    rms_m
+        Root mean square distance of the inliers.
+    """
+
+    plane: Plane
+    covariance: FloatArray
+    basis: FloatArray
+    pivot: FloatArray
+    inliers: tuple[BoolArray, ...]
+    rms_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class StripePair:
+    """The two stripes as lines that leave their common point E.
+
+    Attributes
+    ----------
+    light_plane
+    E_camera : (3,)
+        Common point of both panels' planes and the light plane; may lie beyond both stripes.
+    directions_camera : (2, 3)
+        Unit directions from E towards each stripe.
+    alpha_rad
+        The angle between them, in (0, pi).
+    extents_m : (2, 2)
+        Nearest and farthest inlier of each stripe, as distances from E.
+    """
+
+    light_plane: LightPlane
+    E_camera: FloatArray
+    directions_camera: FloatArray
+    alpha_rad: float
+    extents_m: FloatArray
+
+
+def stripe_on_panel(camera: Camera, T_camera_panel: Pose, stripe: StripePoints) -> StripeOnPanel:
+    """Points of the panel's plane under the stripe's pixels (eqs. (1) to (3)).
+
+    Pixels that have no ray, or whose ray meets the plane behind the camera, are dropped.
+    """
+    plane = Plane.from_pose(T_camera_panel)
+    rays = camera.rays(stripe.pixels)
+    points = plane.intersect_rays(rays)
+    # Derivative of the ray by the pixel, from one small step across the stripe.
+    h = 0.01
+    moved = plane.intersect_rays(camera.rays(stripe.pixels + h * stripe.normals))
+    spread = (moved - points) / h * stripe.sigma_px[:, None]
+    usable = np.isfinite(points).all(axis=1) & np.isfinite(spread).all(axis=1) & (points[:, 2] > 0.0)
+    return StripeOnPanel(points[usable], spread[usable])
+
+
+def fit_light_plane(stripes: Sequence[StripeOnPanel], *, seed: int = 0) -> LightPlane:
+    """Robust, weighted plane through stripes on two or more differently placed panels; (4) without its singularity.
+
+    Each point weighs by how far a standard deviation of its pixel moves it across the plane. A least median over
+    random samples starts Tukey's biweight, so that up to a third of the points may be wrong.
+
+    Raises
+    ------
+    ValueError
+        If there are too few points, or they determine no plane (all on one line).
+    """
+    points = np.vstack([s.points_camera for s in stripes])
+    spread = np.vstack([s.spread_camera for s in stripes])
+    groups: IntArray = np.repeat(np.arange(len(stripes)), [len(s.points_camera) for s in stripes])
+    if len(points) < 4:
+        raise ValueError("a light plane needs at least four points of its stripes")
+    plane = _least_median_plane(points, spread, groups, seed)
+    weight: FloatArray = np.ones(len(points))
+    for _ in range(20):
+        sigma = _sigma_across(plane, points, spread)
+        standardised = plane.distance(points) / sigma
+        scale = max(1.0, mad_sigma(standardised, centred=True))
+        weight = tukey_weights(standardised / scale)
+        refined = fit_plane(points, weight / sigma**2)
+        turned = min(angle_between(refined.normal, plane.normal), angle_between(-refined.normal, plane.normal))
+        plane = refined
+        if turned < 1e-14:
+            break
+    return _with_covariance(plane, points, spread, weight, groups, len(stripes))
+
+
+def stripe_pair(
+    panel_planes: tuple[Plane, Plane], stripes: tuple[StripeOnPanel, StripeOnPanel], *, seed: int = 0
+) -> StripePair:
+    """E, the two directions and alpha (end of section 1.3), from a stripe on each of two panels.
+
+    Raises
+    ------
+    ValueError
+        If the stripes determine no plane, or the panels are parallel (to a degree).
+    """
+    light = fit_light_plane(stripes, seed=seed)
+    if np.linalg.norm(np.cross(panel_planes[0].normal, panel_planes[1].normal)) < np.sin(np.deg2rad(1.0)):
+        raise ValueError("the two panels are parallel")
+    E = intersect_three_planes((*panel_planes, light.plane))
+    directions, extents = [], []
+    for plane, stripe, inliers in zip(panel_planes, stripes, light.inliers, strict=True):
+        if inliers.sum() < 2:
+            raise ValueError("a stripe has fewer than two good points")
+        line = light.plane.intersect_plane(plane)
+        along = (stripe.points_camera[inliers] - E) @ line.direction
+        sign = 1.0 if np.median(along) > 0.0 else -1.0
+        directions.append(sign * line.direction)
+        extents.append([(sign * along).min(), (sign * along).max()])
+    return StripePair(
+        light, E, np.array(directions), float(angle_between(directions[0], directions[1])), np.array(extents)
+    )
+
+
+def _sigma_across(plane: Plane, points: FloatArray, spread: FloatArray) -> FloatArray:
+    sigma = np.abs(spread @ plane.normal)
+    # A point whose pixel moves it along the plane would weigh without bound.
+    floor = 0.05 * np.linalg.norm(spread, axis=1)
+    return np.asarray(np.maximum(np.maximum(sigma, floor), 1e-12))
+
+
+def _least_median_plane(points: FloatArray, spread: FloatArray, groups: IntArray, seed: int) -> Plane:
+    rng = np.random.default_rng(seed)
+    samples = _samples(rng, groups)
+    a, b, c = points[samples[:, 0]], points[samples[:, 1]], points[samples[:, 2]]
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1)
+    reach = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
+    good = length > 1e-3 * reach
+    if not good.any():
+        return fit_plane(points)
+    normals, a = normals[good] / length[good, None], a[good]
+    some = np.linspace(0, len(points) - 1, min(SCORED_POINTS, len(points))).astype(int)
+    distance = np.abs(points[some] @ normals.T - (a * normals).sum(axis=1))
+    sigma = np.maximum(np.abs(spread[some] @ normals.T), 0.05 * np.linalg.norm(spread[some], axis=1)[:, None])
+    best = int(np.argmin(np.median(distance / np.maximum(sigma, 1e-12), axis=0)))
+    return Plane(normals[best], float(normals[best] @ a[best]))
+
+
+def _samples(rng: np.random.Generator, groups: IntArray) -> IntArray:
+    """Samples (HYPOTHESES, 3): two points of one stripe and one of another, since one stripe determines no plane."""
+    first = rng.integers(len(groups), size=HYPOTHESES)
+    samples = np.column_stack([first, first, first])
+    for group in np.unique(groups):
+        of_group = groups[first] == group
+        own, others = np.flatnonzero(groups == group), np.flatnonzero(groups != group)
+        samples[of_group, 1] = rng.choice(own, of_group.sum())
+        samples[of_group, 2] = rng.choice(others if len(others) else own, of_group.sum())
+    return samples
+
+
+def _with_covariance(
+    plane: Plane, points: FloatArray, spread: FloatArray, weight: FloatArray, groups: IntArray, count: int
+) -> LightPlane:
+    sigma = _sigma_across(plane, points, spread)
+    inliers = weight > 0.0
+    information = weight / sigma**2
+    pivot = information @ points / information.sum()
+    # In the plane, along and across the points' own extent.
+    axes = np.linalg.eigh((points - pivot).T @ ((points - pivot) * information[:, None]))[1]
+    u = unit(axes[:, 2] - (axes[:, 2] @ plane.normal) * plane.normal)
+    basis = np.stack([u, np.cross(plane.normal, u)])
+    rows = np.column_stack([(points - pivot) @ basis.T, -np.ones(len(points))])
+    chi2 = float(np.sum(information * plane.distance(points) ** 2))
+    excess = max(1.0, chi2 / max(1.0, float(weight.sum()) - 3.0))
+    covariance = np.linalg.pinv(rows.T @ (rows * information[:, None])) * excess
+    rms = float(np.sqrt(np.mean(plane.distance(points[inliers]) ** 2)))
+    return LightPlane(
+        plane, covariance, basis, pivot, tuple(np.asarray(inliers[groups == k]) for k in range(count)), rms
+    )

@@ -1,0 +1,357 @@
+"""From poses at single places to one function of the turntable's reading (turntable paper, section 2).
+
+Two ways of the same section. `fit_by_circles` is the paper to the letter: the axis from the circle of a unit vector's
+tip (16), the circle of centres (15), phases and the quadratic's solution (25). `fit_by_readings` uses what the paper
+leaves aside: the readings are known, so the rotations alone give the axis, and the circle's centre and radius follow
+from linear equations. It has neither the bias of a circle fit to a short arc, nor the trouble of unsigned angles past
+half a turn, nor does it need a circle that is more than a point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarpose.errors import UndeterminedError
+from lidarpose.geometry.arrays import BoolArray, FloatArray, angle_between, perpendicular_pair, unit
+from lidarpose.geometry.circles import fit_circle3
+from lidarpose.geometry.planes import fit_plane
+from lidarpose.geometry.robust import tukey_weights
+from lidarpose.geometry.se3 import Pose, exp_so3, log_so3, nearest_rotation, rotation_z, skew
+from lidarpose.model.turntable import TurntableMotion
+
+# Readings closer than this are one and the same place (a thousandth of a degree).
+SAME_READING_RAD = 2e-5
+PAIRS = 60
+# What a pose is known from splits in two: the light plane, and the two lines within it.
+ACROSS_SCAN_PLANE = [2, 3, 4]
+IN_SCAN_PLANE = [0, 1, 5]
+# Below this (of a stated sigma, or in metres and radians) residuals are rounding.
+LEAST_SCALE = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionDeviations:
+    """How far the function passes from the samples that it was fitted to: the paper's Table 1, not an error.
+
+    Attributes
+    ----------
+    centre_m, z_rad, x_rad : (N,)
+        Distance of the LiDAR's centre, angles of its z and x axes, sample by sample.
+    """
+
+    centre_m: FloatArray
+    z_rad: FloatArray
+    x_rad: FloatArray
+
+    def table(self) -> dict[str, float]:
+        """The six numbers of Table 1 in its units."""
+        return {
+            "centre_mean_mm": float(self.centre_m.mean() * 1e3),
+            "centre_max_mm": float(self.centre_m.max() * 1e3),
+            "z_mean_deg": float(np.rad2deg(self.z_rad.mean())),
+            "z_max_deg": float(np.rad2deg(self.z_rad.max())),
+            "x_mean_deg": float(np.rad2deg(self.x_rad.mean())),
+            "x_max_deg": float(np.rad2deg(self.x_rad.max())),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class TurntableFunction:
+    """A turning motion fitted to samples, and which of them support it.
+
+    Attributes
+    ----------
+    motion
+    inliers : (N,)
+    deviations
+        Of all samples, inliers or not.
+    """
+
+    motion: TurntableMotion
+    inliers: BoolArray
+    deviations: FunctionDeviations
+
+
+def deviations(
+    motion: TurntableMotion, turntable_angles_rad: Sequence[float], poses: Sequence[Pose]
+) -> FunctionDeviations:
+    """Deviations of a motion from samples of it (Table 1)."""
+    modelled = [motion.pose(angle) for angle in turntable_angles_rad]
+    centre = [np.linalg.norm(m.translation - p.translation) for m, p in zip(modelled, poses, strict=True)]
+    z = [angle_between(m.rotation[:, 2], p.rotation[:, 2]) for m, p in zip(modelled, poses, strict=True)]
+    x = [angle_between(m.rotation[:, 0], p.rotation[:, 0]) for m, p in zip(modelled, poses, strict=True)]
+    return FunctionDeviations(np.array(centre), np.array(z), np.array(x))
+
+
+def fit_by_readings(
+    turntable_angles_rad: Sequence[float],
+    poses: Sequence[Pose],
+    covariances: Sequence[FloatArray] | None = None,
+) -> TurntableFunction:
+    """The motion that fits the poses best, from the known readings; robust against single bad poses.
+
+    A growing reading turns right-handed about z of the turntable's frame: that alone fixes the axis' sense.
+
+    Parameters
+    ----------
+    turntable_angles_rad, poses
+        N >= 3 readings with T_camera_lidar (or the pose of any body that turns with the table).
+    covariances : N times (6, 6), optional
+        Of the poses' left perturbations. Only their shape counts: how well the pose is known along its own z and
+        in its own x-y plane is rescaled to what the residuals show. Without them translations count alike in all
+        directions, and so do rotations.
+
+    Raises
+    ------
+    UndeterminedError
+        If there are fewer than three different readings, or the readings differ only by whole turns.
+    """
+    angles = np.asarray(turntable_angles_rad, dtype=np.float64)
+    require_readings(angles)
+    R = np.stack([p.rotation for p in poses])
+    t = np.stack([p.translation for p in poses])
+    T_w, T_m = _start_from_pairs(angles, R, t)
+    information = _information(poses, covariances, _residuals(angles, R, t, T_w, T_m))
+    weight: FloatArray = np.ones(len(angles))
+    for _ in range(30):
+        previous = weight
+        scaled, weight = _reweigh(_residuals(angles, R, t, T_w, T_m), information)
+        T_w, T_m = _fit_motion(angles, R, t, scaled * weight[:, None, None], T_w, T_m)
+        if np.abs(weight - previous).max() < 1e-4:
+            break
+    motion = TurntableMotion.from_any_frame(T_w, T_m)
+    return TurntableFunction(motion, np.asarray(weight > 0.0), deviations(motion, list(angles), poses))
+
+
+def fit_by_circles(turntable_angles_rad: Sequence[float], poses: Sequence[Pose]) -> TurntableFunction:
+    """The paper's section 2 to the letter, as far as it holds: for comparison, and where no reading can be trusted.
+
+    Where the circle of n_z is too small to tell its plane (the scan plane perpendicular to the axis), the circle of
+    n_x takes its place. Angles are signed and unwrapped by the readings, so that arcs beyond half a turn are right.
+
+    Raises
+    ------
+    UndeterminedError
+        As `fit_by_readings`.
+    """
+    angles = np.asarray(turntable_angles_rad, dtype=np.float64)
+    require_readings(angles)
+    n_x = np.stack([p.rotation[:, 0] for p in poses])
+    n_z = np.stack([p.rotation[:, 2] for p in poses])
+    centres = np.stack([p.translation for p in poses])
+    widest = max((n_z, n_x), key=_circle_size) if _circle_size(n_z) < 0.05 else n_z
+    axis = _turning_sense(fit_plane(widest).normal, angles, widest)  # (16): the plane of the circle
+    centre, arm = _circle_function(axis, angles, centres)  # (15), (18) to (21)
+    R_first = _axes_function(axis, angles, n_z, n_x)  # (22) to (26), at reading 0
+    T_w = _frame_about(axis, centre)
+    T_m = T_w.inverse() @ Pose(R_first, centre + arm)
+    motion = TurntableMotion.from_any_frame(T_w, T_m)
+    return TurntableFunction(motion, np.ones(len(angles), dtype=bool), deviations(motion, list(angles), poses))
+
+
+def require_readings(angles: FloatArray) -> None:
+    """Raise UndeterminedError unless there are three different readings that are not whole turns apart."""
+    turned = np.sort(angles)
+    different = 1 + int(np.count_nonzero(np.diff(turned) > SAME_READING_RAD)) if len(turned) else 0
+    if different < 3:
+        raise UndeterminedError(
+            f"The turntable's motion needs places at three or more different readings; {different} can be used",
+            remedy="Record more places, a few degrees apart, with the stripe on both panels",
+        )
+    if np.abs(np.sin((angles - angles[0]) / 2.0)).max() < SAME_READING_RAD:
+        raise UndeterminedError(
+            "All readings are whole turns apart, so the LiDAR has always stood in the same place",
+            remedy="Record places at different angles of the turntable",
+        )
+
+
+# --- by the readings ---------------------------------------------------------------------------------------------
+
+
+def _start_from_pairs(angles: FloatArray, R: FloatArray, t: FloatArray) -> tuple[Pose, Pose]:
+    """The motion of the pair of places that most places agree with (least median)."""
+    best: tuple[float, Pose, Pose] | None = None
+    for i, j in _wide_pairs(angles):
+        T_w, T_m = motion_of_pair(angles[[i, j]], R[[i, j]], t[[i, j]])
+        e = _residuals(angles, R, t, T_w, T_m)
+        # A radian counts as a metre: scores are only compared among the pairs of one session.
+        score = float(np.median(np.einsum("na,na->n", e, e)))
+        if best is None or score < best[0]:
+            best = (score, T_w, T_m)
+    assert best is not None
+    return best[1], best[2]
+
+
+def motion_of_pair(angles: FloatArray, R: FloatArray, t: FloatArray) -> tuple[Pose, Pose]:
+    """The turning motion T_w @ Rz(reading) @ T_m through two poses: `R` (2, 3, 3), `t` (2, 3)."""
+    R_w = _frame_about(motion_axis(R[0], R[1], float(angles[1] - angles[0])), np.zeros(3)).rotation
+    turns = R_w @ rotation_z(angles)
+    R_m = (np.swapaxes(turns, -1, -2) @ R).sum(axis=0)
+    # t_i = point + turned arm, the arm along x and y of the turntable's frame.
+    rows = np.concatenate([np.broadcast_to(np.eye(3), (2, 3, 3)), turns[:, :, :2]], axis=2).reshape(6, 5)
+    mean = t.mean(axis=0)
+    solution = np.linalg.lstsq(rows, (t - mean).ravel(), rcond=1e-12)[0]
+    arm = np.array([solution[3], solution[4], 0.0])
+    return Pose(R_w, solution[:3] + mean), Pose(nearest_rotation(R_m), arm)
+
+
+def motion_axis(R_first: FloatArray, R_second: FloatArray, turn_rad: float) -> FloatArray:
+    """Unit axis (3,) of the turn by `turn_rad` (signed, not a multiple of a whole turn) from one rotation to another.
+
+    At half a turn the sense cannot be seen from two rotations; then either is returned.
+    """
+    moved = R_second @ R_first.T
+    vector = log_so3(moved)
+    folded = (turn_rad + np.pi) % (2.0 * np.pi) - np.pi
+    return np.asarray(unit(vector if folded >= 0.0 else -vector))
+
+
+def _wide_pairs(angles: FloatArray) -> list[tuple[int, int]]:
+    """Pairs of places, those first whose turn shows the axis best, spread over all places."""
+    i, j = np.triu_indices(len(angles), 1)
+    # Best is a right angle; short turns and nearly whole ones show little, half a turn hides its sense.
+    use = np.abs(np.sin(angles[j] - angles[i])) + 0.2 * np.abs(np.sin((angles[j] - angles[i]) / 2.0))
+    order = np.argsort(-use, kind="stable")[: max(PAIRS, len(use) // 4)]
+    order = order[use[order] > 0.05 * use[order[0]]]
+    chosen = order[:: max(1, len(order) // PAIRS)][:PAIRS]
+    return [(int(i[k]), int(j[k])) for k in chosen]
+
+
+def _residuals(angles: FloatArray, R: FloatArray, t: FloatArray, T_w: Pose, T_m: Pose) -> FloatArray:
+    """Residuals (N, 6) of poses in the LiDAR's own frame: translation, rotation."""
+    turned = T_w.rotation @ rotation_z(angles)
+    back = np.swapaxes(turned @ T_m.rotation, -1, -2)
+    shift = t - (turned @ T_m.translation + T_w.translation)
+    return np.concatenate([(back @ shift[..., None])[..., 0], log_so3(back @ R)], axis=1)
+
+
+def _information(poses: Sequence[Pose], covariances: Sequence[FloatArray] | None, residuals: FloatArray) -> FloatArray:
+    """Information (N, 6, 6) of each pose in the LiDAR's own frame."""
+    if covariances is None:
+        # A length of three normal components has the median 1.538 sigma.
+        sigma_t = max(float(np.median(np.linalg.norm(residuals[:, :3], axis=1))) / 1.538, LEAST_SCALE)
+        sigma_r = max(float(np.median(np.linalg.norm(residuals[:, 3:], axis=1))) / 1.538, LEAST_SCALE)
+        diagonal = np.diag([sigma_t**-2] * 3 + [sigma_r**-2] * 3)
+        return np.broadcast_to(diagonal, (len(poses), 6, 6))
+    own = []
+    for pose, covariance in zip(poses, covariances, strict=True):
+        Ad = pose.inverse().adjoint()
+        own.append(np.linalg.inv(Ad @ covariance @ Ad.T))
+    return np.stack(own)
+
+
+def _reweigh(residuals: FloatArray, information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Information with the scales that the residuals show, and Tukey's weight (N,) of each place."""
+    scale = np.ones(6)
+    for block in (ACROSS_SCAN_PLANE, IN_SCAN_PLANE):
+        e = residuals[:, block]
+        squares = np.einsum("na,nab,nb->n", e, np.linalg.inv(np.linalg.inv(information)[:, block][:, :, block]), e)
+        # The median of chi-squared with three degrees of freedom is 2.366.
+        scale[block] = max(np.sqrt(float(np.median(squares)) / 2.366), LEAST_SCALE)
+    scaled = information / np.outer(scale, scale)
+    squares = np.einsum("na,nab,nb->n", residuals, scaled, residuals)
+    return scaled, tukey_weights(np.sqrt(squares / 6.0), 3.5)
+
+
+def _fit_motion(
+    angles: FloatArray, R: FloatArray, t: FloatArray, information: FloatArray, T_w: Pose, T_m: Pose
+) -> tuple[Pose, Pose]:
+    """Weighted least squares of T_i = T_w @ Rz(angle_i) @ T_m by Gauss-Newton on left perturbations of both factors."""
+    for _ in range(30):
+        e = _residuals(angles, R, t, T_w, T_m)
+        J = _motion_jacobian(angles, T_w, T_m)
+        H = np.einsum("nac,nab,nbd->cd", J, information, J, optimize=True)
+        g = np.einsum("nac,nab,nb->c", J, information, e, optimize=True)
+        # The turn about z and the shift along it may be put into either factor: the smallest step leaves it alone.
+        root = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+        step = root * np.linalg.lstsq(H * np.outer(root, root), g * root, rcond=1e-11)[0]
+        T_w, T_m = _stepped(T_w, step[:6]), _stepped(T_m, step[6:])
+        if np.abs(step).max() < 1e-13:
+            break
+    return T_w, T_m
+
+
+def _motion_jacobian(angles: FloatArray, T_w: Pose, T_m: Pose) -> FloatArray:
+    """Derivative (N, 6, 12) of each modelled pose, in the LiDAR's own frame, by left perturbations of both factors."""
+    turned = T_w.rotation @ rotation_z(angles)
+    back = np.swapaxes(turned @ T_m.rotation, -1, -2)
+    places = turned @ T_m.translation + T_w.translation
+    J = np.zeros((len(angles), 6, 12))
+    J[:, :3, :3] = J[:, 3:, 3:6] = back
+    J[:, :3, 3:6] = -back @ skew(places)
+    J[:, :, 6:] = T_m.inverse().adjoint()
+    return J
+
+
+def _stepped(pose: Pose, step: FloatArray) -> Pose:
+    moved = Pose.exp(step) @ pose
+    return Pose(nearest_rotation(moved.rotation), moved.translation)
+
+
+def _frame_about(axis: FloatArray, origin: FloatArray) -> Pose:
+    u, v = perpendicular_pair(axis)
+    return Pose(np.column_stack([u, v, unit(axis)]), origin)
+
+
+# --- by circles, the paper's way ---------------------------------------------------------------------------------
+
+
+def _circle_size(tips: FloatArray) -> float:
+    """How far the tips (N, 3) of a unit vector move: the radius of their circle at least, rad."""
+    return float(np.linalg.norm(tips - tips.mean(axis=0), axis=1).max())
+
+
+def _turning_sense(axis: FloatArray, angles: FloatArray, tips: FloatArray) -> FloatArray:
+    """The axis (3,) turned so that the tips move right-handed about it as the reading grows."""
+    moved = tips - tips.mean(axis=0)
+    best = max((axis, -axis), key=lambda w: _coherence(w, angles, moved))
+    return np.asarray(best)
+
+
+def _coherence(axis: FloatArray, angles: FloatArray, vectors: FloatArray) -> float:
+    """How well vectors (N, 3) line up once each is turned back by its reading about the axis."""
+    return float(np.linalg.norm(np.einsum("nij,nj->i", exp_so3(-angles[:, None] * axis), vectors)))
+
+
+def _phase(axis: FloatArray, angles: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Unit direction (3,) at reading 0 of vectors (N, 3) that turn with the table.
+
+    The mean of signed phases of (19) and (22), taken on the circle: unsigned angles would break past half a turn.
+    """
+    flat = vectors - (vectors @ axis)[:, None] * axis
+    back = np.einsum("nij,nj->ni", exp_so3(-angles[:, None] * axis), flat)
+    length = np.linalg.norm(back, axis=1, keepdims=True)
+    if not np.all(length > 0.0):
+        return np.zeros(3)
+    total = (back / length).sum(axis=0)
+    return np.asarray(unit(total)) if np.linalg.norm(total) > 0.0 else np.zeros(3)
+
+
+def _circle_function(axis: FloatArray, angles: FloatArray, centres: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Centre G of the circle of centres, and the arm from it at reading 0."""
+    try:
+        circle = fit_circle3(centres, axis)
+    except ValueError:  # the LiDAR's centre lies on the axis
+        return centres.mean(axis=0), np.zeros(3)
+    return circle.centre, circle.radius * _phase(axis, angles, centres - circle.centre)
+
+
+def _axes_function(axis: FloatArray, angles: FloatArray, n_z: FloatArray, n_x: FloatArray) -> FloatArray:
+    """Rotation (3, 3) of the LiDAR at reading 0: n_z from its circle, n_x from the conditions (25)."""
+    d_z, d_x = float((n_z @ axis).mean()), float((n_x @ axis).mean())
+    z_0 = d_z * axis + np.sqrt(max(0.0, 1.0 - d_z**2)) * _phase(axis, angles, n_z)
+    z_0 = unit(z_0)
+    mean_x = unit(np.einsum("nij,nj->i", exp_so3(-angles[:, None] * axis), n_x))
+    across = np.cross(axis, z_0)
+    if np.linalg.norm(across) < 1e-3:  # n_z along the axis: (25) is singular, n_x has a circle of its own
+        x_0 = unit(mean_x - (mean_x @ z_0) * z_0)
+    else:
+        in_both = np.linalg.solve(np.stack([axis, z_0, across]), [d_x, 0.0, 0.0])
+        along = unit(across)
+        height = np.sqrt(max(0.0, 1.0 - float(in_both @ in_both)))
+        # The quadratic's two solutions; the one that resembles the samples more is the true one.
+        x_0 = max((unit(in_both + s * height * along) for s in (1.0, -1.0)), key=lambda x: float(x @ mean_x))
+    return np.column_stack([x_0, np.cross(z_0, x_0), z_0])
