@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +48,17 @@ class ScanOptions:
     indices: bool = False
     keep_order: bool = False
     never_stops: bool = False
+
+    def fields(self, recording: SweepRecording) -> dict[str, np.dtype[Any]]:
+        """Names and types of the fields that the clouds will have."""
+        fields: dict[str, np.dtype[Any]] = {}
+        if recording.intensity is not None:
+            fields["intensity"] = recording.intensity.dtype
+        if self.sigma:
+            fields["sigma_m"] = np.dtype(np.float32)
+        if self.indices:
+            fields["sweep"] = fields["beam"] = np.dtype(np.int32)
+        return fields
 
 
 def assemble_scan(
