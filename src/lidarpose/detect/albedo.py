@@ -1,0 +1,195 @@
+"""How light or dark a chessboard is at every point of the image, sharp edges and the lens's blur kept apart.
+
+The bright image alone says how much light every pixel sends back, but already blurred: a laser's stripe is multiplied
+by the board's albedo before the lens blurs it, not after. So the board is modelled: squares whose edges are where the
+corners say, light and dark levels as the bright image shows them (they vary over the board), and the blur of the lens,
+measured on the squares' edges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from lidarpose.detect.grid_map import GridMap
+from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.model.image import GrayImage
+
+# Inside a square, away from its blurred edges, as fractions of it.
+_INNER = np.linspace(0.25, 0.75, 5)
+_SQRT2 = np.sqrt(2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PanelAlbedo:
+    """A panel's squares as the bright image shows them.
+
+    Squares are counted from the outer ring: square (i, j) reaches from grid coordinate i - 1 to i, and j - 1 to j.
+
+    Attributes
+    ----------
+    grid_map
+        From grid coordinates (squares) to pixels.
+    light, dark : (rows + 1, columns + 1)
+        Grey level that a light, and a dark, surface has at each square's place.
+    usable : (rows + 1, columns + 1)
+        False for squares that are not as a chessboard's are (cut short, covered, glaring).
+    first_is_dark
+        Whether the square before the first corner, at (0, 0), is dark.
+    blur_px
+        Standard deviation of the lens's blur, pixels, the pixel's own width included.
+    """
+
+    grid_map: GridMap
+    light: FloatArray
+    dark: FloatArray
+    usable: BoolArray
+    first_is_dark: bool
+    blur_px: float
+
+    def levels(self, grid: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Light and dark level (...) at grid coordinates (..., 2), interpolated between the squares' centres."""
+        where = (grid + 0.5).astype(np.float32).reshape(1, -1, 2)
+        light, dark = (
+            cv2.remap(table.astype(np.float32), where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            for table in (self.light, self.dark)
+        )
+        shape = grid.shape[:-1]
+        return np.asarray(light, np.float64).reshape(shape), np.asarray(dark, np.float64).reshape(shape)
+
+    def sign_at(self, grid_x: FloatArray, grid_y: FloatArray, edge_x: FloatArray, edge_y: FloatArray) -> FloatArray:
+        """Blurred pattern, from -1 (dark) to 1 (light), at grid coordinates; edges blurred by `edge_x`, `edge_y` squares.
+
+        The blur is taken to be small against the squares, so that only the nearest edge each way matters.
+        """
+        sign = soft_square_wave(grid_x, edge_x) * soft_square_wave(grid_y, edge_y)
+        return -sign if self.first_is_dark else sign
+
+    def is_usable(self, grid: FloatArray) -> BoolArray:
+        """True (...) for grid coordinates (..., 2) in squares that are as a chessboard's are."""
+        index = np.floor(grid + 1.0).astype(int)
+        rows, columns = self.usable.shape
+        inside = (index >= 0).all(-1) & (index[..., 0] < columns) & (index[..., 1] < rows)
+        safe = np.where(inside[..., None], index, 0)
+        return np.asarray(inside & self.usable[safe[..., 1], safe[..., 0]])
+
+
+def soft_square_wave(x: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Square wave of period 2 with edges at whole numbers, 1 for x in (0, 1), blurred by a Gaussian of width `sigma`."""
+    from scipy.special import erf
+
+    nearest = np.round(x)
+    rising = 1.0 - 2.0 * (nearest % 2.0)
+    return np.asarray(rising * erf((x - nearest) / (_SQRT2 * np.maximum(sigma, 1e-6))))
+
+
+def measure_albedo(grid_map: GridMap, image: GrayImage | FloatArray) -> PanelAlbedo:
+    """Levels, colour and blur of a panel's squares in a bright image (the mean or median of the shots)."""
+    centres, medians = _square_medians(grid_map, image)
+    rows, columns = medians.shape
+    parity = (np.add.outer(np.arange(rows), np.arange(columns)) % 2).astype(bool)
+    first_is_dark = bool(np.median(medians[~parity]) < np.median(medians[parity]))
+    is_dark = ~parity if first_is_dark else parity
+    light, dark = _fill(medians, ~is_dark), _fill(medians, is_dark)
+    usable = _as_expected(medians, is_dark, light, dark) & _in_image(centres, image.shape)
+    albedo = PanelAlbedo(grid_map, light, dark, usable, first_is_dark, 1.0)
+    return PanelAlbedo(grid_map, light, dark, usable, first_is_dark, _measure_blur(albedo, image))
+
+
+def _square_medians(grid_map: GridMap, image: GrayImage | FloatArray) -> tuple[FloatArray, FloatArray]:
+    columns, rows = grid_map.columns + 1, grid_map.rows + 1
+    x = (np.arange(columns)[:, None] - 1.0 + _INNER).ravel()
+    y = (np.arange(rows)[:, None] - 1.0 + _INNER).ravel()
+    pixels = grid_map.pixels(np.stack(np.meshgrid(x, y), axis=-1))
+    values = sample(image, pixels).reshape(rows, len(_INNER), columns, len(_INNER))
+    centres = pixels[len(_INNER) // 2 :: len(_INNER), len(_INNER) // 2 :: len(_INNER)]
+    return centres, np.median(values.transpose(0, 2, 1, 3).reshape(rows, columns, -1), axis=-1)
+
+
+def sample(image: GrayImage | FloatArray, pixels: FloatArray) -> FloatArray:
+    """Values (...) of an image at pixels (..., 2), bilinear; beyond the border that of the border."""
+    where = pixels.astype(np.float32).reshape(1, -1, 2)
+    source = image if image.dtype in (np.uint8, np.uint16) else image.astype(np.float32)
+    # Remap of integers rounds its results: floats of the part that matters do not.
+    low = np.maximum(np.floor(where.min(axis=(0, 1))).astype(int) - 1, 0)
+    high = np.ceil(where.max(axis=(0, 1))).astype(int) + 2
+    part = np.ascontiguousarray(
+        source[low[1] : max(high[1], low[1] + 1), low[0] : max(high[0], low[0] + 1)], np.float32
+    )
+    if part.size == 0:
+        return np.zeros(pixels.shape[:-1])
+    values = cv2.remap(part, where - low.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, dtype=np.float64).reshape(pixels.shape[:-1])
+
+
+def _fill(medians: FloatArray, known: BoolArray) -> FloatArray:
+    """Levels of one colour everywhere: known squares smoothed, the others from their neighbours.
+
+    Medians of the known squares among the 5 x 5 around: a glare or a stripe on one square does not spread.
+    """
+    rows, columns = medians.shape
+    padded = np.pad(np.where(known, medians, np.nan), 2, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (5, 5)).reshape(rows, columns, 25)
+    smooth = np.nanmedian(windows, axis=-1)
+    # A square's own level counts where it is not far from its neighbours'.
+    spread = 0.15 * np.abs(smooth) + 1.0
+    own = known & (np.abs(medians - smooth) <= spread)
+    nearest = np.pad(np.where(own, medians, np.nan), 1, constant_values=np.nan)
+    around = np.stack([nearest[:-2, 1:-1], nearest[2:, 1:-1], nearest[1:-1, :-2], nearest[1:-1, 2:]])
+    counts = np.isfinite(around).sum(axis=0)
+    mean = np.where(counts > 0, np.nansum(around, axis=0) / np.maximum(counts, 1), smooth)
+    return np.asarray(np.where(own, medians, mean))
+
+
+def _as_expected(medians: FloatArray, is_dark: BoolArray, light: FloatArray, dark: FloatArray) -> BoolArray:
+    """Squares nearer to their own colour's level than to the other's."""
+    expected, other = np.where(is_dark, dark, light), np.where(is_dark, light, dark)
+    return np.asarray((np.abs(medians - expected) < 0.4 * np.abs(expected - other)) & (light > dark))
+
+
+def _in_image(centres: FloatArray, shape: tuple[int, ...]) -> BoolArray:
+    return np.asarray((centres >= 0).all(-1) & (centres[..., 0] < shape[1]) & (centres[..., 1] < shape[0]))
+
+
+def _measure_blur(albedo: PanelAlbedo, image: GrayImage | FloatArray) -> float:
+    """Width of the squares' edges: the Gaussian blur of the model that fits the pixels around them best."""
+    grid, gradient, values = _edge_pixels(albedo, image)
+    if len(values) < 100:
+        return 0.8
+
+    def misfit(blur: float) -> float:
+        edge_x, edge_y = (blur * np.linalg.norm(gradient[:, k], axis=-1) for k in (0, 1))
+        return float(np.minimum(np.abs(albedo.sign_at(grid[:, 0], grid[:, 1], edge_x, edge_y) - values), 1.0).mean())
+
+    from scipy.optimize import minimize_scalar
+
+    best = minimize_scalar(
+        lambda log_blur: misfit(np.exp(log_blur)), bounds=(np.log(0.2), np.log(6.0)), method="bounded"
+    )
+    return float(np.exp(best.x))
+
+
+def _edge_pixels(albedo: PanelAlbedo, image: GrayImage | FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Pixels around the middles of edges between usable squares: grid coordinates (M, 2), their gradient (M, 2, 2) by
+    the pixel, and the value (M,) from -1 (dark) to 1 (light)."""
+    grid_map = albedo.grid_map
+    usable = albedo.usable
+    j, i = np.nonzero(usable[:, :-1] & usable[:, 1:])
+    upright = np.column_stack([i, j - 0.5])
+    j, i = np.nonzero(usable[:-1] & usable[1:])
+    level = np.column_stack([i - 0.5, j])
+    middles = np.concatenate([upright, level]).astype(np.float64)
+    middles = middles[:: max(len(middles) // 200, 1)]
+    pixels = grid_map.pixels(middles)
+    offsets = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)), -1).reshape(-1, 2)
+    whole = np.round(pixels).astype(int)[:, None] + offsets
+    inside = ((whole >= 0) & (whole < [image.shape[1], image.shape[0]])).all(-1)
+    safe = np.where(inside[..., None], whole, 0)
+    gradient = np.linalg.inv(grid_map.jacobian(middles))
+    grid = middles[:, None] + np.einsum("mab,mkb->mka", gradient, whole - pixels[:, None])
+    light, dark = albedo.levels(grid)
+    values = (2.0 * image[safe[..., 1], safe[..., 0]] - light - dark) / (light - dark)
+    gradients = np.broadcast_to(gradient[:, None], (*grid.shape, 2))
+    return grid[inside], gradients[inside], values[inside]

@@ -1,0 +1,88 @@
+"""The laser's stripe on each panel: points on its centre line with a standard deviation each.
+
+A light sheet of Gaussian thickness meets a board whose albedo jumps from square to square, and the lens blurs the
+product of both. With the stripe's width (s) and the lens's blur (b) known, that blur of a product has a closed form: at
+signed distance d from the centre line the pixel sees
+
+    A * Gauss(d; s^2 + b^2) * albedo(at distance d * s^2 / (s^2 + b^2), blurred by s b / sqrt(s^2 + b^2) across and b along)
+
+So a thin stripe under a blurred lens sees the albedo of its centre line only, and its profile is not bent by the edges
+beside it; a thick one under a sharp lens sees it everywhere. This is fitted, column by column of the image (row by row
+for steep stripes), with the ambient light as a multiple of the bright image, and noise that grows with the signal.
+
+The stripe is a straight line on each panel, in the image a smooth curve. It is first sought in a reduced image: the
+ridge's maxima of each column or row, and the straight line that most of them support (RANSAC).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarpose.detect.albedo import measure_albedo
+from lidarpose.detect.chessboard import BoardDetection
+from lidarpose.detect.stripe_fit import fit_stripe
+from lidarpose.detect.stripe_search import PanelView, find_line
+from lidarpose.geometry.arrays import FloatArray
+from lidarpose.model.image import GrayImage
+from lidarpose.model.observation import LeftOut, StripePoints
+
+
+@dataclass(frozen=True)
+class StripeDetection:
+    """The stripes found in one image, by panel, and what was given up with its reason."""
+
+    stripes: Mapping[int, StripePoints]
+    problems: tuple[LeftOut, ...]
+
+
+class StripeFinder:
+    """Finds the stripe in the images of one placement of the board; made once, used for each image.
+
+    Parameters
+    ----------
+    board
+        Where the panels are.
+    bright_images
+        The images that `board` was found in: they give each square's light and dark level, and the ambient light.
+    """
+
+    def __init__(self, board: BoardDetection, bright_images: Sequence[GrayImage]) -> None:
+        used = [image for image, is_used in zip(bright_images, board.shots_used, strict=True) if is_used]
+        bright = _combine(used)
+        self._shape = bright.shape
+        self._limit = float(np.iinfo(bright_images[0].dtype).max)
+        self._views: list[PanelView] = []
+        for grid_map in board.maps:
+            albedo = measure_albedo(grid_map, bright)
+            self._views.append(PanelView.make(albedo, bright))
+
+    def find(self, image: GrayImage) -> StripeDetection:
+        """Stripe points on every panel in an image of the same size as the bright ones (ValueError if not)."""
+        if image.shape != self._shape:
+            raise ValueError(f"the stripe image has {image.shape} pixels, the bright images have {self._shape}")
+        stripes: dict[int, StripePoints] = {}
+        problems: list[LeftOut] = []
+        for k, view in enumerate(self._views):
+            line = find_line(view, image)
+            if isinstance(line, str):
+                problems.append(LeftOut(f"stripe on panel {k}", line))
+                continue
+            fit = fit_stripe(view, image, line, self._limit)
+            if isinstance(fit, str):
+                problems.append(LeftOut(f"stripe on panel {k}", fit))
+                continue
+            stripes[k] = fit.points
+        return StripeDetection(stripes, tuple(problems))
+
+
+def _combine(images: Sequence[GrayImage]) -> FloatArray:
+    """One bright image (float32) of several shots: the mean of two, else the median (deaf to what passes by)."""
+    if len(images) == 1:
+        return images[0].astype(np.float32)
+    if len(images) == 2:
+        return np.asarray((images[0].astype(np.float32) + images[1].astype(np.float32)) / 2.0)
+    stack = np.stack(images[:9])
+    return np.asarray(np.median(stack, axis=0), dtype=np.float32)
