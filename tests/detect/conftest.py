@@ -90,7 +90,7 @@ class Scene:
 
     def _fine(self) -> tuple[Array, Array, Array, Array]:
         if not self.cache:
-            # A lattice with one sample in each column and row of its cell: a regular one would shift the edges that run along it.
+            # One sample in each column and row of its cell: a regular grid would shift edges that run along it.
             k = np.arange(self.samples)[:, None]
             pattern = ((0.5 + k * [1, 7]) / self.samples) % 1.0
             pattern = pattern - pattern.mean(axis=0)

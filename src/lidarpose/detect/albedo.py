@@ -51,18 +51,14 @@ class PanelAlbedo:
 
     def levels(self, grid: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Light and dark level (...) at grid coordinates (..., 2), interpolated between the squares' centres."""
-        where = (grid + 0.5).astype(np.float32).reshape(1, -1, 2)
-        light, dark = (
-            cv2.remap(table.astype(np.float32), where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            for table in (self.light, self.dark)
-        )
-        shape = grid.shape[:-1]
-        return np.asarray(light, np.float64).reshape(shape), np.asarray(dark, np.float64).reshape(shape)
+        light, dark = (sample(table, grid + 0.5) for table in (self.light, self.dark))
+        return light, dark
 
     def sign_at(self, grid_x: FloatArray, grid_y: FloatArray, edge_x: FloatArray, edge_y: FloatArray) -> FloatArray:
-        """Blurred pattern, from -1 (dark) to 1 (light), at grid coordinates; edges blurred by `edge_x`, `edge_y` squares.
+        """Blurred pattern, from -1 (dark) to 1 (light), at grid coordinates.
 
-        The blur is taken to be small against the squares, so that only the nearest edge each way matters.
+        Edges are blurred by Gaussians of width `edge_x`, `edge_y` squares. The blur is taken to be small against the
+        squares, so that only the nearest edge each way matters.
         """
         sign = soft_square_wave(grid_x, edge_x) * soft_square_wave(grid_y, edge_y)
         return -sign if self.first_is_dark else sign
@@ -77,7 +73,7 @@ class PanelAlbedo:
 
 
 def soft_square_wave(x: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Square wave of period 2 with edges at whole numbers, 1 for x in (0, 1), blurred by a Gaussian of width `sigma`."""
+    """Square wave of period 2 with edges at whole numbers, 1 for x in (0, 1), blurred by a Gaussian (`sigma`)."""
     from scipy.special import erf
 
     nearest = np.round(x)
@@ -110,17 +106,14 @@ def _square_medians(grid_map: GridMap, image: GrayImage | FloatArray) -> tuple[F
 
 def sample(image: GrayImage | FloatArray, pixels: FloatArray) -> FloatArray:
     """Values (...) of an image at pixels (..., 2), bilinear; beyond the border that of the border."""
-    where = pixels.astype(np.float32).reshape(1, -1, 2)
-    source = image if image.dtype in (np.uint8, np.uint16) else image.astype(np.float32)
-    # Remap of integers rounds its results: floats of the part that matters do not.
-    low = np.maximum(np.floor(where.min(axis=(0, 1))).astype(int) - 1, 0)
-    high = np.ceil(where.max(axis=(0, 1))).astype(int) + 2
-    part = np.ascontiguousarray(
-        source[low[1] : max(high[1], low[1] + 1), low[0] : max(high[0], low[0] + 1)], np.float32
-    )
+    x, y = (np.ascontiguousarray(pixels[..., k], dtype=np.float32).reshape(1, -1) for k in (0, 1))
+    # Remap of integers rounds its results: the part that matters is made float.
+    low_x, low_y = (max(int(np.floor(c.min())) - 1, 0) for c in (x, y))
+    high_x, high_y = (max(int(np.ceil(c.max())) + 2, low + 1) for c, low in ((x, low_x), (y, low_y)))
+    part = np.asarray(image[low_y:high_y, low_x:high_x], dtype=np.float32)
     if part.size == 0:
         return np.zeros(pixels.shape[:-1])
-    values = cv2.remap(part, where - low.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    values = cv2.remap(part, x - low_x, y - low_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float64).reshape(pixels.shape[:-1])
 
 
@@ -185,7 +178,7 @@ def _edge_pixels(albedo: PanelAlbedo, image: GrayImage | FloatArray) -> tuple[Fl
     pixels = grid_map.pixels(middles)
     offsets = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)), -1).reshape(-1, 2)
     whole = np.round(pixels).astype(int)[:, None] + offsets
-    inside = ((whole >= 0) & (whole < [image.shape[1], image.shape[0]])).all(-1)
+    inside = np.asarray(((whole >= 0) & (whole < [image.shape[1], image.shape[0]])).all(-1))
     safe = np.where(inside[..., None], whole, 0)
     gradient = np.linalg.inv(grid_map.jacobian(middles))
     grid = middles[:, None] + np.einsum("mab,mkb->mka", gradient, whole - pixels[:, None])

@@ -4,7 +4,8 @@ A light sheet of Gaussian thickness meets a board whose albedo jumps from square
 product of both. With the stripe's width (s) and the lens's blur (b) known, that blur of a product has a closed form: at
 signed distance d from the centre line the pixel sees
 
-    A * Gauss(d; s^2 + b^2) * albedo(at distance d * s^2 / (s^2 + b^2), blurred by s b / sqrt(s^2 + b^2) across and b along)
+    A * Gauss(d; s^2 + b^2) * albedo, taken at distance d s^2 / (s^2 + b^2)
+                                      and blurred by s b / sqrt(s^2 + b^2) across and by b along the stripe
 
 So a thin stripe under a blurred lens sees the albedo of its centre line only, and its profile is not bent by the edges
 beside it; a thick one under a sharp lens sees it everywhere. This is fitted, column by column of the image (row by row
@@ -84,5 +85,5 @@ def _combine(images: Sequence[GrayImage]) -> FloatArray:
         return images[0].astype(np.float32)
     if len(images) == 2:
         return np.asarray((images[0].astype(np.float32) + images[1].astype(np.float32)) / 2.0)
-    stack = np.stack(images[:9])
-    return np.asarray(np.median(stack, axis=0), dtype=np.float32)
+    stack = np.stack([image.astype(np.float32) for image in images[:9]])
+    return np.asarray(np.median(stack, axis=0))

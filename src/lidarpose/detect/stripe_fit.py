@@ -195,11 +195,11 @@ def _first_curve(band: _Band, line: CoarseLine, straight: _Curve) -> tuple[_Curv
 
 def _fit_curve(u: FloatArray, v: FloatArray, weight: FloatArray, degree: int) -> _Curve:
     used = weight > 0
-    middle, half = (u[used].min() + u[used].max()) / 2.0, max(np.ptp(u[used]) / 2.0, 1.0)
+    middle, half = float(u[used].min() + u[used].max()) / 2.0, max(float(np.ptp(u[used])) / 2.0, 1.0)
     root = np.sqrt(weight[used])
     design = np.polynomial.polynomial.polyvander((u[used] - middle) / half, degree)
     coefficients = np.linalg.lstsq(design * root[:, None], v[used] * root, rcond=None)[0]
-    return _Curve(coefficients, float(middle), float(half))
+    return _Curve(coefficients, middle, half)
 
 
 def _geometry(albedo: PanelAlbedo, steep: bool, u: FloatArray, curve: _Curve) -> _Geometry:

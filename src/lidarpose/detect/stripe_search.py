@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from lidarpose.detect.albedo import PanelAlbedo
 from lidarpose.geometry.arrays import BoolArray, FloatArray
@@ -60,7 +59,7 @@ class PanelView:
         small = reduce_image(part, factor)
         y, x = np.indices(small.shape)
         centres = np.stack([x, y], axis=-1) * factor + (factor - 1) / 2.0 + low
-        grid = _coarse_grid(albedo, centres, factor)
+        grid = _dense_grid(albedo, centres, factor)
         inside = albedo.is_usable(grid)
         away = np.abs(grid - np.round(grid)).min(axis=-1) > 0.2
         is_light = albedo.sign_at(grid[..., 0], grid[..., 1], np.array(0.01), np.array(0.01)) > 0
@@ -80,7 +79,7 @@ class PanelView:
         return image[self.low[1] : self.high[1], self.low[0] : self.high[0]]
 
 
-def reduce_image(image: NDArray[np.generic], factor: int) -> FloatArray:
+def reduce_image(image: GrayImage | FloatArray, factor: int) -> FloatArray:
     """Mean of blocks of factor x factor pixels (float32)."""
     if factor == 1:
         return np.asarray(image, dtype=np.float32)
@@ -88,13 +87,15 @@ def reduce_image(image: NDArray[np.generic], factor: int) -> FloatArray:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
-def _coarse_grid(albedo: PanelAlbedo, pixels: FloatArray, factor: int) -> FloatArray:
+def _dense_grid(albedo: PanelAlbedo, pixels: FloatArray, factor: int) -> FloatArray:
     """Grid coordinates of a dense field of pixels, exact on every eighth and interpolated between."""
     step = max(8 // factor, 1)
-    nodes = albedo.grid_map.grid(pixels[::step, ::step])
-    y, x = np.indices(pixels.shape[:2], dtype=np.float32)
-    grid = cv2.remap(nodes.astype(np.float32), x / step, y / step, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(grid, dtype=np.float64)
+    height, width = pixels.shape[:2]
+    y, x = np.mgrid[0 : height + step : step, 0 : width + step : step]
+    nodes = albedo.grid_map.grid(np.stack([x, y], axis=-1) * factor + pixels[0, 0])
+    rows, columns = (np.asarray(index / step, dtype=np.float32) for index in np.indices((height, width)))
+    channels = [cv2.remap(nodes[..., k].astype(np.float32), columns, rows, cv2.INTER_LINEAR) for k in (0, 1)]
+    return np.stack([np.asarray(channel, dtype=np.float64) for channel in channels], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +156,7 @@ class _SmallLine:
 
 
 def _without_ambient(view: PanelView, small: FloatArray) -> tuple[FloatArray, float]:
-    """What the bright image does not explain, made flat by a wide background, zero off the panel; and the ambient share."""
+    """What the bright image does not explain, made flat, zero off the panel; and the ambient share."""
     light, dark = np.median(small[view.light]), np.median(small[view.dark])
     bright_light, bright_dark = np.median(view.small_bright[view.light]), np.median(view.small_bright[view.dark])
     share = max(float(light - dark) / max(float(bright_light - bright_dark), 1.0), 0.0)
