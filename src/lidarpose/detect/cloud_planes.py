@@ -1,0 +1,300 @@
+"""Planes of a cloud: connected flat patches, the largest first, on clouds of any density and order.
+
+Strategy. A random subsample of a few thousand points keeps the cloud's own density (a voxel grid would even it out and
+lose small dense faces). Around random points of it, planes through near neighbours are the hypotheses; all are scored
+against the subsample at once, in one matrix product. The best is optimised locally, cut to its largest connected
+patch, and refitted there on the full cloud, never over the unbounded slab. Its points leave, the scores of the others
+follow by one product more, and only when the subsample is used up another is drawn from what is left, so that small
+faces come up once the large ones are gone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
+from lidarpose.geometry.planes import Plane
+from lidarpose.geometry.robust import mad_sigma
+from lidarpose.model.plane_patch import PlanePatch
+
+Float32Array = NDArray[np.float32]
+
+SAMPLE_SIZE = 4096
+HYPOTHESES = 1000
+# Neighbourhoods of a hypothesis, in nearest points of the subsample: wide ones reach across the gaps between the lines
+# of a multi-beam LiDAR, narrow ones fit on small faces.
+NEIGHBOURHOODS = (10, 20, 40, 80)
+POINTS_PER_HYPOTHESIS = 10
+GATE_SIGMAS = 3.0
+MIN_SIGMA_M = 2e-4
+# A patch is connected across gaps of this share of its range, which spans the lines of a 16-beam LiDAR on a slope.
+GAP_PER_RANGE = 0.06
+MIN_GAP_M = 0.04
+
+
+@dataclass(frozen=True)
+class PlaneSearch:
+    """What to look for. `max_planes` ends the search early; patches of fewer than `min_points` are not reported."""
+
+    max_planes: int = 40
+    min_points: int = 30
+    min_share: float = 0.0
+    max_rounds: int = 6
+    seed: int = 0
+
+
+@dataclass(eq=False)
+class _Sample:
+    """A subsample with its hypotheses: planes (H, 4) as normal and offset, and who is near which, (H, S) as 0 or 1."""
+
+    indices: IntArray
+    points: Float32Array
+    planes: FloatArray
+    near: Float32Array
+    sigma_m: float
+
+
+def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = None) -> tuple[PlanePatch, ...]:
+    """Find the connected flat patches of a cloud.
+
+    Parameters
+    ----------
+    points : (N, 3)
+        Metres, finite; the frame's origin is where the sensor stands (normals point there).
+    search
+        Limits of the search, and its seed.
+
+    Returns
+    -------
+    The patches, in the order found (roughly by size). No point belongs to two.
+    """
+    search = search or PlaneSearch()
+    x: Float32Array = np.ascontiguousarray(points, dtype=np.float32)
+    rng = np.random.default_rng(search.seed)
+    least = max(search.min_points, int(search.min_share * len(x)))
+    free = np.ones(len(x), dtype=bool)
+    patches: list[PlanePatch] = []
+    sigma_m: float | None = None
+    for _ in range(search.max_rounds):
+        remaining = np.flatnonzero(free)
+        if len(remaining) < max(least, POINTS_PER_HYPOTHESIS) or len(patches) >= search.max_planes:
+            break
+        sample = _draw(x, remaining, sigma_m, rng)
+        found = _harvest(x, free, sample, least, search.max_planes - len(patches))
+        if not found:
+            break
+        patches += found
+        sigma_m = float(np.median([p.sigma_m for p in patches]))
+    return tuple(patches)
+
+
+def _draw(x: Float32Array, remaining: IntArray, sigma_m: float | None, rng: np.random.Generator) -> _Sample:
+    """Draw a subsample of the remaining points, and hypotheses around random points of it."""
+    from scipy.spatial import cKDTree
+
+    if len(remaining) > SAMPLE_SIZE:
+        indices = remaining[rng.integers(0, len(remaining), SAMPLE_SIZE)]
+        indices = np.unique(indices)
+    else:
+        indices = remaining
+    points = x[indices]
+    count = min(HYPOTHESES, 4 * len(points))
+    seeds = rng.integers(0, len(points), count)
+    widest = min(NEIGHBOURHOODS[-1], len(points))
+    _, neighbours = cKDTree(points).query(points[seeds], k=widest)
+    # Hypothesis h takes its points from the first NEIGHBOURHOODS[h mod 4] neighbours.
+    reach = np.minimum(np.array(NEIGHBOURHOODS)[np.arange(count) % len(NEIGHBOURHOODS)], widest)
+    picks = (rng.random((count, POINTS_PER_HYPOTHESIS)) * reach[:, None]).astype(np.int64)
+    chosen = points[np.take_along_axis(neighbours, picks, axis=1)]
+    planes, thickness, flat = _local_planes(chosen)
+    if sigma_m is None:
+        sigma_m = _noise_from_neighbourhoods(thickness[flat])
+    planes = planes[flat & (thickness < 4.0 * sigma_m)]
+    distance = points @ planes[:, :3].astype(np.float32).T - planes[:, 3].astype(np.float32)
+    near = (np.abs(distance) < np.float32(GATE_SIGMAS * sigma_m)).astype(np.float32)
+    return _Sample(indices, points, planes, near, sigma_m)
+
+
+def _local_planes(chosen: Float32Array) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Planes (H, 4) through neighbourhoods (H, K, 3), their thickness (H,), and whether they have two extents."""
+    mean = chosen.mean(axis=1, dtype=np.float64)
+    d = chosen - mean[:, None, :]
+    values, vectors = np.linalg.eigh(np.einsum("hki,hkj->hij", d, d, optimize=False) / chosen.shape[1])
+    normals = vectors[:, :, 0]
+    planes = np.column_stack([normals, np.einsum("hi,hi->h", normals, mean)])
+    thickness = np.sqrt(np.maximum(values[:, 0], 0.0) * chosen.shape[1] / (chosen.shape[1] - 3.0))
+    return planes, thickness, values[:, 1] > 0.01 * values[:, 2]
+
+
+def _noise_from_neighbourhoods(thickness: FloatArray) -> float:
+    """The noise across flat neighbourhoods: the median one, as most of a scene is flat."""
+    if len(thickness) == 0:
+        return MIN_SIGMA_M
+    return max(float(np.quantile(thickness, 0.5)), MIN_SIGMA_M)
+
+
+def _harvest(x: Float32Array, free: BoolArray, sample: _Sample, least: int, at_most: int) -> list[PlanePatch]:
+    """Take the patches of one subsample, best first; their points are no longer `free`."""
+    patches: list[PlanePatch] = []
+    active = np.ones(len(sample.points), dtype=np.float32)
+    scale = max(np.count_nonzero(free) / len(sample.points), 1.0)
+    # Fewer points of the subsample than this say too little; a later subsample has more of them.
+    least_sample = max(least / scale, 12.0)
+    dead = np.zeros(len(sample.planes), dtype=bool)
+    while len(patches) < at_most and not dead.all():
+        votes = active @ sample.near
+        votes[dead] = -1.0
+        if votes.max() < least_sample:
+            break
+        candidate, component, hypothesis = _best_patch(sample, active, votes)
+        if component.sum() < least_sample:
+            dead |= sample.near[component].sum(axis=0) > 0.5 * np.maximum(component.sum(), 1)
+            dead[hypothesis] = True
+            continue
+        patch = _refit(x, free, candidate, sample, component)
+        if patch is None or len(patch) < least:
+            dead[hypothesis] = True
+            dead |= sample.near[component].sum(axis=0) > 0.8 * component.sum()
+            continue
+        patches.append(patch)
+        free[patch.indices] = False
+        active[~free[sample.indices]] = 0.0
+    return patches
+
+
+def _best_patch(sample: _Sample, active: Float32Array, votes: Float32Array) -> tuple[Plane, BoolArray, int]:
+    """Of the hypotheses with most votes the one whose largest connected patch is largest, optimised locally."""
+    leaders = np.argsort(-votes)[:24:6]
+    best: tuple[int, Plane, BoolArray, int] | None = None
+    for leader in leaders:
+        if best is not None and votes[leader] <= best[0]:
+            break
+        inside = (sample.near[:, leader] > 0.5) & (active > 0.5)
+        plane = Plane(sample.planes[leader, :3], sample.planes[leader, 3])
+        component = _largest_component(sample.points, inside, plane)
+        if best is None or component.sum() > best[0]:
+            best = int(component.sum()), plane, component, int(leader)
+    assert best is not None
+    _, plane, component, leader_index = best
+    for _ in range(3):
+        if component.sum() < 6:
+            break
+        plane = _moment_plane(sample.points[component])
+        distance = np.abs(sample.points @ plane.normal.astype(np.float32) - np.float32(plane.offset))
+        inside = (distance < GATE_SIGMAS * sample.sigma_m) & (active > 0.5)
+        component = _largest_component(sample.points, inside, plane)
+    return plane, component, leader_index
+
+
+def _moment_plane(points: NDArray[np.floating]) -> Plane:
+    """Total least squares plane; the normal points to the origin's side."""
+    mean = points.mean(axis=0, dtype=np.float64)
+    d = points - mean.astype(points.dtype)
+    normal = np.linalg.eigh((d.T @ d).astype(np.float64))[1][:, 0]
+    offset = float(normal @ mean)
+    return Plane(normal, offset) if offset <= 0.0 else Plane(-normal, -offset)
+
+
+@dataclass(frozen=True, eq=False)
+class _Raster:
+    """A grid on a plane: cells of side `cell_m` along the axes (2, 3), counted from `origin` (2,)."""
+
+    axes: FloatArray
+    cell_m: float
+    origin: IntArray
+    shape: tuple[int, int]
+
+    def cells(self, points: NDArray[np.floating]) -> IntArray:
+        """Cells (M,) of points (M, 3) as flat numbers; -1 outside."""
+        uv = np.floor(points @ (self.axes.T / self.cell_m).astype(points.dtype)).astype(np.int64) - self.origin
+        inside = (uv >= 0).all(axis=1) & (uv < self.shape).all(axis=1)
+        return np.where(inside, uv[:, 0] * self.shape[1] + uv[:, 1], -1)
+
+
+def _raster(points: NDArray[np.floating], plane: Plane, cell_m: float, border: int) -> _Raster:
+    from lidarpose.geometry.arrays import perpendicular_pair
+
+    axes = np.stack(perpendicular_pair(plane.normal))
+    uv = np.floor(points @ (axes.T / cell_m).astype(points.dtype)).astype(np.int64)
+    low, high = uv.min(axis=0) - border, uv.max(axis=0) + border + 1
+    shape = np.minimum(high - low, 4000)
+    return _Raster(axes, cell_m, low, (int(shape[0]), int(shape[1])))
+
+
+def gap_m(points: NDArray[np.floating]) -> float:
+    """The gap across which points (M, 3) of one surface still count as connected."""
+    ranges = np.sqrt(np.einsum("ij,ij->i", points, points))
+    return max(MIN_GAP_M, GAP_PER_RANGE * float(np.median(ranges)))
+
+
+def _largest_component(points: Float32Array, inside: BoolArray, plane: Plane) -> BoolArray:
+    """Of the points `inside` (S,), those of the largest piece that hangs together across gaps, on the plane."""
+    from scipy import ndimage
+
+    members = np.flatnonzero(inside)
+    result = np.zeros(len(points), dtype=bool)
+    if len(members) == 0:
+        return result
+    chosen = points[members]
+    # A thinned subsample has gaps of its own: twice the spacing that its own number and extent give.
+    raster = _raster(chosen, plane, _cell_size(chosen, plane), 0)
+    cells = raster.cells(chosen)
+    occupied = np.bincount(cells[cells >= 0], minlength=raster.shape[0] * raster.shape[1]).reshape(raster.shape)
+    labels, pieces = ndimage.label(occupied > 0, structure=np.ones((3, 3)))
+    if pieces > 1:
+        sizes = np.bincount(labels.ravel(), weights=occupied.ravel())
+        sizes[0] = 0
+        keep = (cells >= 0) & (labels.ravel()[cells] == int(np.argmax(sizes)))
+        members = members[keep]
+    result[members] = True
+    return result
+
+
+def _cell_size(chosen: Float32Array, plane: Plane) -> float:
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(chosen.T.astype(np.float64))), 0.0)) if len(chosen) > 3 else [0.0] * 3
+    area = 12.0 * float(spread[1] * spread[2])
+    return max(gap_m(chosen), 2.0 * float(np.sqrt(area / max(len(chosen), 1))))
+
+
+def _refit(
+    x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, component: BoolArray
+) -> PlanePatch | None:
+    """The patch on the full cloud: free points near the plane in the cells that the component occupies."""
+    seen = sample.points[component]
+    raster = _raster(seen, plane, _cell_size(seen, plane), 1)
+    occupied = np.zeros(raster.shape[0] * raster.shape[1] + 1, dtype=bool)
+    occupied[raster.cells(seen)] = True
+    allowed = np.append(_grown(occupied[:-1].reshape(raster.shape)).ravel(), False)
+    sigma_m = sample.sigma_m
+    reach = np.float32(3.0 * GATE_SIGMAS * sigma_m)
+    distance = x @ plane.normal.astype(np.float32) - np.float32(plane.offset)
+    near = np.flatnonzero((np.abs(distance) < reach) & free)
+    near = near[allowed[raster.cells(x[near])]]
+    chosen = near
+    for _ in range(3):
+        distance = x[near] @ plane.normal.astype(np.float32) - np.float32(plane.offset)
+        chosen = near[np.abs(distance) < GATE_SIGMAS * sigma_m]
+        if len(chosen) < 6:
+            return None
+        plane = _moment_plane(x[chosen])
+        residual = x[chosen] @ plane.normal.astype(np.float32) - np.float32(plane.offset)
+        sigma_m = min(max(mad_sigma(residual, centred=True), MIN_SIGMA_M, 0.5 * sample.sigma_m), 3.0 * sample.sigma_m)
+    # A plane stands out from what is around it: a slab through scattered clutter does not.
+    distance = x[near] @ plane.normal.astype(np.float32) - np.float32(plane.offset)
+    around = int(np.count_nonzero(np.abs(distance) < 2.0 * GATE_SIGMAS * sigma_m))
+    if len(chosen) < 0.6 * around:
+        return None
+    return PlanePatch(plane, chosen, sigma_m)
+
+
+def _grown(occupied: BoolArray) -> BoolArray:
+    grown = occupied.copy()
+    for axis in (0, 1):
+        before = grown.copy()
+        for step in (-1, 1):
+            shifted = np.roll(before, step, axis=axis)
+            grown |= shifted
+    return grown

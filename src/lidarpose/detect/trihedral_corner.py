@@ -1,0 +1,264 @@
+"""Corners of three faces in a cloud: candidates among its patches, and a known corner's returns face by face."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, perpendicular_pair
+from lidarpose.geometry.planes import Plane
+from lidarpose.model.corner_result import CornerCandidate
+from lidarpose.model.plane_patch import PlanePatch
+
+# Faces of a wall or the ground count only this far from the corner.
+REACH_M = 1.2
+# A corner may be cropped or missing by this much and still be that of its faces.
+MAX_MISSING_M = 0.35
+# Three faces whose normals span less than this volume determine their corner badly.
+MIN_VOLUME = 0.12
+MIN_FACE_POINTS = 12
+# Share of a face's points that have to lie on the right side of the other two.
+ONE_SIDED = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class _Local:
+    """A patch's points within reach of a corner."""
+
+    points: FloatArray
+    plane: Plane
+
+
+def find_corners(
+    points: NDArray[np.floating], patches: tuple[PlanePatch, ...], near: FloatArray | None = None, radius_m: float = 0.3
+) -> tuple[CornerCandidate, ...]:
+    """All corners that three patches make, convex or concave; best supported first.
+
+    Parameters
+    ----------
+    points : (N, 3)
+        The cloud, its origin at the sensor.
+    patches
+        What `segment_planes` found in it.
+    near, radius_m
+        Only corners within `radius_m` of `near` (3,), if given.
+    """
+    if len(patches) < 3:
+        return ()
+    triples, corners = _meeting_triples(points, patches)
+    if near is not None:
+        close = np.linalg.norm(corners - near, axis=1) <= radius_m
+        triples, corners = triples[close], corners[close]
+    found = [c for t, corner in zip(triples, corners, strict=True) if (c := _candidate(points, patches, t, corner))]
+    return _without_doubles(sorted(found, key=lambda c: -c.support))
+
+
+def _meeting_triples(points: NDArray[np.floating], patches: tuple[PlanePatch, ...]) -> tuple[IntArray, FloatArray]:
+    """Triples (T, 3) of patches whose common point (T, 3) lies in the neighbourhood of all three."""
+    normals = np.stack([p.plane.normal for p in patches])
+    offsets = np.array([p.plane.offset for p in patches])
+    triples = np.array(list(combinations(range(len(patches)), 3)))
+    systems = normals[triples]
+    good = np.abs(np.linalg.det(systems)) > MIN_VOLUME
+    triples, systems = triples[good], systems[good]
+    if len(triples) == 0:
+        return triples, np.zeros((0, 3))
+    corners = np.linalg.solve(systems, offsets[triples][..., None])[..., 0]
+    low = np.stack([points[p.indices].min(axis=0) for p in patches]) - MAX_MISSING_M
+    high = np.stack([points[p.indices].max(axis=0) for p in patches]) + MAX_MISSING_M
+    inside = (corners[:, None] > low[triples]).all(axis=(1, 2)) & (corners[:, None] < high[triples]).all(axis=(1, 2))
+    return triples[inside], np.asarray(corners[inside])
+
+
+def _candidate(
+    points: NDArray[np.floating], patches: tuple[PlanePatch, ...], triple: IntArray, corner: FloatArray
+) -> CornerCandidate | None:
+    faces = [patches[k] for k in triple]
+    local = []
+    for face in faces:
+        around = points[face.indices].astype(np.float64)
+        distance = np.linalg.norm(around - corner, axis=1)
+        around = around[distance < REACH_M]
+        if len(around) < MIN_FACE_POINTS or distance.min() > MAX_MISSING_M:
+            return None
+        local.append(around)
+    convex = _common_side(local, faces)
+    if convex is None:
+        return None
+    local = [_within_common_reach(p, local, corner) for p in local]
+    if min(len(p) for p in local) < MIN_FACE_POINTS:
+        return None
+    outlines = [_outline(p, f.plane) for p, f in zip(local, faces, strict=True)]
+    if any(len(o) < 3 for o in outlines):
+        return None
+    obstacles = _obstacles(points, patches, triple, local)
+    return CornerCandidate(
+        corner,
+        np.stack([f.plane.normal for f in faces]),
+        convex,
+        (outlines[0], outlines[1], outlines[2]),
+        obstacles,
+        min(len(p) for p in local),
+        float(np.median([f.sigma_m for f in faces])),
+    )
+
+
+def _common_side(local: list[FloatArray], faces: list[PlanePatch]) -> bool | None:
+    """True if all edges are convex, False if all are concave, None if they are mixed or a face crosses another."""
+    convex = []
+    for i in range(3):
+        for j in range(3):
+            if i == j:
+                continue
+            height = faces[j].plane.distance(local[i])
+            tolerance = 3.0 * max(faces[i].sigma_m, faces[j].sigma_m)
+            if np.mean(height < tolerance) >= ONE_SIDED:
+                convex.append(True)
+            elif np.mean(height > -tolerance) >= ONE_SIDED:
+                convex.append(False)
+            else:
+                return None
+    return convex[0] if len(set(convex)) == 1 else None
+
+
+def _within_common_reach(points: FloatArray, local: list[FloatArray], corner: FloatArray) -> FloatArray:
+    """Points no farther from the corner than the smallest face reaches: a wall's or the ground's rest is no target."""
+    reach = min(float(np.quantile(np.linalg.norm(p - corner, axis=1), 0.98)) for p in local)
+    return points[np.linalg.norm(points - corner, axis=1) <= 1.3 * reach]
+
+
+def _outline(points: FloatArray, plane: Plane) -> FloatArray:
+    """The convex outline (K, 3) of points on a plane, counter-clockwise seen from the normal's side."""
+    u, v = perpendicular_pair(plane.normal)
+    flat = np.column_stack([points @ u, points @ v])
+    order = np.lexsort((flat[:, 1], flat[:, 0]))
+    lower = _half_hull(flat, order)
+    upper = _half_hull(flat, order[::-1])
+    return plane.project(points[lower[:-1] + upper[:-1]])
+
+
+def _half_hull(flat: FloatArray, order: IntArray) -> list[int]:
+    """Andrew's monotone chain."""
+    hull: list[int] = []
+    for k in order:
+        while len(hull) >= 2:
+            a, b, c = flat[hull[-2]], flat[hull[-1]], flat[k]
+            if (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) > 0.0:
+                break
+            hull.pop()
+        hull.append(int(k))
+    return hull
+
+
+def _obstacles(
+    points: NDArray[np.floating], patches: tuple[PlanePatch, ...], triple: IntArray, local: list[FloatArray]
+) -> tuple[Plane, ...]:
+    """Planes of other patches that touch the faces: what a face's beam meets below the target's foot."""
+    all_local = np.concatenate(local)
+    low, high = all_local.min(axis=0) - 0.1, all_local.max(axis=0) + 0.1
+    found = []
+    for k, patch in enumerate(patches):
+        if k in triple:
+            continue
+        theirs = points[patch.indices]
+        theirs = theirs[((theirs > low) & (theirs < high)).all(axis=1)]
+        if len(theirs) < 20:
+            continue
+        height = patch.plane.distance(all_local)
+        # It borders the target only if the target stands wholly on its free side, and close to it.
+        if np.mean(height > -3.0 * patch.sigma_m) > 0.97 and np.quantile(height, 0.02) < 0.1:
+            found.append(patch.plane)
+    return tuple(found)
+
+
+def _without_doubles(candidates: list[CornerCandidate]) -> tuple[CornerCandidate, ...]:
+    kept: list[CornerCandidate] = []
+    for candidate in candidates:
+        if all(np.linalg.norm(candidate.corner - other.corner) > 0.05 for other in kept):
+            kept.append(candidate)
+    return tuple(kept)
+
+
+@dataclass(frozen=True, eq=False)
+class FaceMask:
+    """Which beams meet which face of a corner, told by their direction alone.
+
+    Selecting by the measured point would favour returns whose noise happens to suit the model; the direction has no
+    noise. A beam belongs to the face that it meets first on a convex corner's, last on a concave one's planes.
+    """
+
+    corner: FloatArray
+    normals: FloatArray
+    convex: bool
+    outlines: tuple[FloatArray, FloatArray, FloatArray]
+    obstacles: tuple[Plane, ...]
+    margin_m: float
+
+    def select(self, points: NDArray[np.floating], gate_m: float) -> tuple[IntArray, IntArray]:
+        """Indices (M,) of points (N, 3) on the faces, and the face of each; residual ranges within `gate_m`."""
+        x = points
+        radius = max(float(np.linalg.norm(o - self.corner, axis=1).max()) for o in self.outlines) + 0.1
+        offset = x - self.corner.astype(x.dtype)
+        close = np.flatnonzero(np.einsum("ij,ij->i", offset, offset) < radius * radius)
+        near = x[close].astype(np.float64)
+        ranges = np.linalg.norm(near, axis=1)
+        u = near / ranges[:, None]
+        face, predicted, step = self.meet(u)
+        good = (np.abs(ranges - predicted) < gate_m) & (step > 0.0)
+        close, u, face, predicted = close[good], u[good], face[good], predicted[good]
+        inside = self._inside(u * predicted[:, None], face)
+        return close[inside], face[inside]
+
+    def meet(self, directions: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """By direction (N, 3): the face met, the range there (inf if none), and by how far the next plane differs."""
+        slope = directions @ self.normals.T
+        height = self.normals @ self.corner
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ranges = height / slope
+        facing = slope < -0.02
+        worst = -np.inf if self.convex else np.inf
+        ranges = np.where(facing, ranges, worst)
+        face = np.argmax(ranges, axis=1) if self.convex else np.argmin(ranges, axis=1)
+        ordered = np.sort(ranges, axis=1)
+        best = np.take_along_axis(ranges, face[:, None], axis=1)[:, 0]
+        step = ordered[:, 2] - ordered[:, 1] if self.convex else ordered[:, 1] - ordered[:, 0]
+        # A back face of a convex corner lies in front of what is seen if it is met there: then the beam misses.
+        if self.convex:
+            away = slope > 0.02
+            with np.errstate(divide="ignore", invalid="ignore"):
+                leave = np.where(away, height / slope, np.inf)
+            best = np.where((leave > 0.0) & (leave < best), np.inf, best)
+        return face.astype(np.int64), best, step
+
+    def _inside(self, on_face: FloatArray, face: IntArray) -> BoolArray:
+        """Which predicted points (N, 3) lie in their face's outline, off its edges with others and off obstacles."""
+        inside = np.zeros(len(on_face), dtype=bool)
+        for j in range(3):
+            mine = np.flatnonzero(face == j)
+            p = on_face[mine]
+            good = _in_outline(p, self.outlines[j], self.normals[j], 0.02)
+            for k in range(3):
+                if k != j:
+                    # Distance from the common edge, along this face.
+                    sine = np.linalg.norm(np.cross(self.normals[j], self.normals[k]))
+                    edge = np.abs((p - self.corner) @ self.normals[k]) / sine
+                    good &= edge > self.margin_m
+            for plane in self.obstacles:
+                sine = max(float(np.linalg.norm(np.cross(self.normals[j], plane.normal))), 0.2)
+                good &= plane.distance(p) / sine > 2.0 * self.margin_m + 0.01
+            inside[mine] = good
+        return inside
+
+
+def _in_outline(points: FloatArray, outline: FloatArray, normal: FloatArray, slack_m: float) -> BoolArray:
+    """Which points (N, 3) of a plane lie in a convex outline (K, 3), widened by `slack_m`."""
+    edges = np.roll(outline, -1, axis=0) - outline
+    inward = np.cross(normal, edges)
+    length = np.linalg.norm(inward, axis=1)
+    keep = length > 1e-9
+    inward = inward[keep] / length[keep, None]
+    height = points @ inward.T - np.einsum("ij,ij->i", inward, outline[keep])
+    return np.asarray((height > -slack_m).all(axis=1))

@@ -1,0 +1,192 @@
+"""Corner sessions: the folder described in docs/formats.md becomes a `CornerSession`, and the other way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from lidarpose.errors import InputError
+from lidarpose.geometry.arrays import FloatArray
+from lidarpose.model.cloud import Cloud
+from lidarpose.model.corner_session import CornerPlace, CornerSession
+from lidarpose.storage.atomic import write_text
+from lidarpose.storage.documents import Schema, check_format, parse, read_toml
+from lidarpose.storage.session import LidarSection, inside
+from lidarpose.storage.tables import TextTable, read_text_table
+
+CORNER_SESSION_FORMAT = "lidarpose/corner-session@1"
+CLOUD_SUFFIXES = (".pcd", ".ply", ".las", ".laz", ".e57", ".npy")
+MAX_PLACES = 10_000
+MAX_WORLD_M = 1e7
+
+_WORLD = ("world_x_m", "world_y_m", "world_z_m")
+_NEAR = ("near_x_m", "near_y_m", "near_z_m")
+
+
+class _SessionFile(Schema):
+    format: Literal["lidarpose/corner-session@1"]
+    positions: str
+    world_sigma_m: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    estimate_scale: bool = False
+    cloud_frame: Literal["lidar", "camera"] = "lidar"
+    lidar: LidarSection = LidarSection()
+
+
+@dataclass(frozen=True)
+class FileCloud:
+    """One frame of a session, read when asked for."""
+
+    path: Path
+    name: str
+
+    def load(self) -> Cloud:
+        """Read the cloud. Raises InputError if it is missing, cut off, or in a format that is not known."""
+        from lidarpose.storage.clouds import read_cloud
+
+        return read_cloud(self.path)
+
+
+def read_corner_session(folder: Path) -> CornerSession:
+    """Read a corner session's description; clouds are read later, when they are asked for.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the key or line, what was expected and how to mend it.
+    """
+    file = folder / "session.toml"
+    if not folder.is_dir():
+        problem = "is missing" if not folder.exists() else "is not a folder"
+        raise InputError(folder, problem, expected="a session's folder")
+    document = parse(file, _SessionFile, check_format(file, read_toml(file), CORNER_SESSION_FORMAT))
+    places = _read_places(folder, inside(folder, document.positions, file, "positions"))
+    return CornerSession(
+        str(folder),
+        places,
+        document.world_sigma_m,
+        document.estimate_scale,
+        document.cloud_frame,
+        document.lidar.spec(),
+    )
+
+
+def _read_places(folder: Path, path: Path) -> tuple[CornerPlace, ...]:
+    table = read_text_table(path, ("position", *_WORLD, "clouds"), _NEAR)
+    if not table.rows:
+        raise InputError(path, "has no positions", expected="a row for each place of the target, three or more")
+    if len(table.rows) > MAX_PLACES:
+        raise InputError(path, f"has {len(table.rows)} rows", expected=f"at most {MAX_PLACES}")
+    present = [name for name in _NEAR if name in table.columns]
+    if present and len(present) < len(_NEAR):
+        raise InputError(path, f"has {', '.join(present)} alone", field="line 1", expected=", ".join(_NEAR))
+    _check_names(table)
+    return tuple(_place(folder, table, row) for row in range(len(table.rows)))
+
+
+def _check_names(table: TextTable) -> None:
+    for column in ("position", "clouds"):
+        seen: dict[str, int] = {}
+        for cells, line in zip(table.rows, table.lines, strict=True):
+            value = cells[column]
+            if not value:
+                raise InputError(table.path, f"line {line} has none", field=column, expected="a value in every row")
+            if value in seen:
+                problem = f"{value!r} stands in lines {seen[value]} and {line}"
+                raise InputError(table.path, problem, field=column, expected="each once")
+            seen[value] = line
+
+
+def _place(folder: Path, table: TextTable, row: int) -> CornerPlace:
+    cells, line = table.rows[row], table.lines[row]
+    world = np.array([table.number(row, name) for name in _WORLD])
+    if np.abs(world).max() > MAX_WORLD_M:
+        raise InputError(table.path, f"line {line} is {np.abs(world).max():g} from the origin", expected="metres")
+    clouds = tuple(_find_clouds(folder, table.path, line, cells["clouds"]))
+    return CornerPlace(cells["position"], world, clouds, _near(table, row))
+
+
+def _near(table: TextTable, row: int) -> FloatArray | None:
+    cells = [table.rows[row].get(name, "") for name in _NEAR]
+    if not any(cells):
+        return None
+    if not all(cells):
+        problem = f"line {table.lines[row]} has only a part of the hint"
+        raise InputError(table.path, problem, field=",".join(_NEAR), expected="three numbers, or none")
+    return np.array([table.number(row, name) for name in _NEAR])
+
+
+def _find_clouds(folder: Path, file: Path, line: int, pattern: str) -> Iterator[FileCloud]:
+    relative = PurePosixPath(pattern)
+    if relative.is_absolute() or ".." in relative.parts:
+        problem = f"line {line} has {pattern!r}"
+        raise InputError(file, problem, field="clouds", expected="a pattern inside the session's folder")
+    found = sorted(p for p in folder.glob(str(relative)) if p.is_file() and not p.name.startswith("."))
+    if not found:
+        raise InputError(
+            file,
+            f"line {line}: no file matches {pattern!r}",
+            field="clouds",
+            expected="at least one cloud (" + " ".join(CLOUD_SUFFIXES) + ")",
+        )
+    for path in found:
+        if path.suffix.lower() not in CLOUD_SUFFIXES:
+            problem = f"line {line}: {path.name} matches {pattern!r} but is no cloud"
+            raise InputError(file, problem, field="clouds", expected="files " + " ".join(CLOUD_SUFFIXES))
+        yield FileCloud(path, path.relative_to(folder).as_posix())
+
+
+def write_corner_session(folder: Path, session: CornerSession, *, suffix: str = ".pcd") -> None:
+    """Write a session as a folder: clouds first, its description last, so that a broken-off write is no session.
+
+    Raises
+    ------
+    InputError
+        If the folder already holds a session, or cannot be written to.
+    """
+    from lidarpose.storage.clouds import write_cloud
+
+    if (folder / "session.toml").exists():
+        raise InputError(folder, "already holds a session", remedy="Name another folder, or remove this one.")
+    rows = []
+    for index, place in enumerate(session.places):
+        sub = f"clouds/p{index:02d}"
+        for k, source in enumerate(place.clouds):
+            write_cloud(folder / sub / f"{k:03d}{suffix}", source.load())
+        numbers = [*place.corner_world, *(place.near if place.near is not None else ())]
+        cells = [place.position, *(f"{x:.6f}" for x in numbers[:3]), f"{sub}/*{suffix}"]
+        rows.append([*cells, *(f"{x:.3f}" for x in numbers[3:])])
+    hints = any(place.near is not None for place in session.places)
+    header = ["position", *_WORLD, "clouds", *(_NEAR if hints else ())]
+    lines = [",".join(row + [""] * (len(header) - len(row))) for row in [header, *rows]]
+    write_text(folder / "positions.csv", "\n".join(lines) + "\n")
+    write_text(folder / "session.toml", _session_toml(session))
+
+
+def _session_toml(session: CornerSession) -> str:
+    lines = [f'format = "{CORNER_SESSION_FORMAT}"', 'positions = "positions.csv"']
+    if session.world_sigma_m is not None:
+        lines.append(f"world_sigma_m = {session.world_sigma_m:.9g}")
+    lines.append(f"estimate_scale = {str(session.estimate_scale).lower()}")
+    lines.append(f'cloud_frame = "{session.cloud_frame}"')
+    lines.append("[lidar]")
+    if session.lidar.model is not None:
+        lines.append(f'model = "{session.lidar.model}"')
+    if session.lidar.range_sigma_m is not None:
+        lines.append(f"range_sigma_m = {session.lidar.range_sigma_m:.9g}")
+    return "\n".join(lines) + "\n"
+
+
+def corner_truth_document(transform: dict[str, Any], positions: list[dict[str, Any]]) -> dict[str, Any]:
+    """What OUT.truth.json of a simulated corner session holds: the true transform, and the corner at each place."""
+    return {
+        "format": "lidarpose/calibration@1",
+        "kind": "world",
+        "transforms": [transform],
+        "scale": 1.0,
+        "positions": positions,
+    }

@@ -1,0 +1,71 @@
+"""Planes and corners in simulated clouds, dense and sparse, against the truth."""
+
+import numpy as np
+import pytest
+
+from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
+from lidarpose.detect.trihedral_corner import find_corners
+from lidarpose.geometry.arrays import FloatArray, angle_between, unit
+from lidarpose.simulate.corner_scene import CornerSceneSpec, simulate_corner_session
+from lidarpose.solve.corner_matching import match_corners
+
+
+def three_faces_and_clutter(n: int, small_share: float, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Two large faces, a small one and 30 % clutter, 5 mm noise; and the faces' normals."""
+    rng = np.random.default_rng(seed)
+    normals = np.array([[0.0, 0.0, 1.0], [-1.0, 0.1, 0.0], [-0.1, -1.0, 0.0]])
+    normals = unit(normals)
+    corner = np.array([3.0, 2.0, -1.0])
+    parts = []
+    for k, share in enumerate((0.7 - small_share) * np.array([0.5, 0.5, 0.0]) + small_share * np.array([0, 0, 1.0])):
+        u, v = np.linalg.svd(normals[k][None])[2][1:]
+        size = 0.3 if k == 2 else 1.5
+        flat = rng.uniform(-size, size, (int(n * share), 2))
+        shift = np.array([-1.6, -0.2, 0.4]) if k == 2 else np.zeros(3)
+        shift = shift - (shift @ normals[k]) * normals[k]
+        points = corner + shift + flat @ np.stack([u, v])
+        parts.append(points + rng.normal(0.0, 0.005, (len(points), 1)) * normals[k])
+    parts.append(corner + rng.uniform(-1.5, 1.5, (n - sum(len(p) for p in parts), 3)))
+    points = np.concatenate(parts)
+    return points[rng.permutation(n)], normals
+
+
+@pytest.mark.parametrize("n", [60_000, 300_000])
+def test_three_faces_are_found_among_clutter_the_small_one_too(n: int) -> None:
+    points, normals = three_faces_and_clutter(n, 0.02, 1)
+    patches = segment_planes(points, PlaneSearch(max_planes=6))
+    for normal in normals:
+        errors = [float(angle_between(p.plane.normal * np.sign(p.plane.normal @ normal), normal)) for p in patches]
+        assert np.degrees(min(errors)) < 0.1
+    belonging = np.concatenate([p.indices for p in patches])
+    assert len(np.unique(belonging)) == len(belonging)
+
+
+def test_the_same_seed_gives_the_same_planes() -> None:
+    points, _ = three_faces_and_clutter(20_000, 0.05, 2)
+    first, again = segment_planes(points), segment_planes(points)
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a.indices, b.indices)
+
+
+def test_scattered_points_have_no_planes_and_few_points_no_answer() -> None:
+    rng = np.random.default_rng(3)
+    assert segment_planes(rng.uniform(-2.0, 2.0, (5000, 3))) == ()
+    assert segment_planes(np.zeros((0, 3))) == ()
+    assert segment_planes(rng.normal(size=(5, 3))) == ()
+
+
+@pytest.mark.parametrize("target", ["cube", "concave", "oblique"])
+@pytest.mark.parametrize("lidar", ["hdl32", "turntable"])
+def test_the_target_is_told_from_clutter_by_its_moves(target: str, lidar: str) -> None:
+    spec = CornerSceneSpec(target=target, frames=1, places=4, room=True, clutter=8, seed=7, lidar=lidar)  # type: ignore[arg-type]
+    session, truth = simulate_corner_session(spec)
+    candidates = []
+    for place in session.places:
+        points = place.clouds[0].load().points
+        candidates.append(find_corners(points, segment_planes(points)))
+    matches = match_corners(candidates, np.stack([p.corner_world for p in session.places]))
+    assert matches[0].places == 4
+    for here, k, corner in zip(candidates, matches[0].choice, truth.corners_lidar, strict=True):
+        assert k is not None
+        assert np.linalg.norm(here[k].corner - corner) < 0.04

@@ -1,0 +1,75 @@
+"""Corner sessions on disk: what is written is read again, and what is wrong is named."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarpose.errors import InputError
+from lidarpose.simulate.corner_scene import CornerSceneSpec, simulate_corner_session
+from lidarpose.storage.corner_session import read_corner_session, write_corner_session
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    session, _ = simulate_corner_session(CornerSceneSpec(places=3, frames=1, hints=True, world_sigma_m=0.001, seed=1))
+    write_corner_session(tmp_path / "session", session)
+    return tmp_path / "session"
+
+
+@pytest.mark.parametrize("suffix", [".pcd", ".ply", ".npy"])
+def test_a_session_survives_the_disk(tmp_path: Path, suffix: str) -> None:
+    session, _ = simulate_corner_session(CornerSceneSpec(places=3, frames=2, hints=True, world_sigma_m=0.001, seed=1))
+    write_corner_session(tmp_path / "s", session, suffix=suffix)
+    again = read_corner_session(tmp_path / "s")
+    assert again.world_sigma_m == pytest.approx(0.001)
+    assert again.lidar == session.lidar
+    assert again.cloud_frame == "lidar"
+    for a, b in zip(session.places, again.places, strict=True):
+        assert a.position == b.position
+        np.testing.assert_allclose(a.corner_world, b.corner_world, atol=1e-6)
+        assert a.near is not None
+        assert b.near is not None
+        np.testing.assert_allclose(a.near, b.near, atol=1e-3)
+        for x, y in zip(a.clouds, b.clouds, strict=True):
+            np.testing.assert_array_equal(x.load().points, y.load().points)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("world_x_m", "x_m", "world_x_m"),
+        (",near_z_m", "", "near_x_m, near_y_m"),
+        ("p01,", "p00,", "'p00' stands in lines 2 and 3"),
+        ("clouds/p01/", "clouds/p09/", "no file matches 'clouds/p09/"),
+        ("clouds/p01/", "../p01/", "inside the session's folder"),
+        ("p02,", "p02,nan", "a finite number"),
+    ],
+)
+def test_wrong_tables_are_named(folder: Path, old: str, new: str, message: str) -> None:
+    table = folder / "positions.csv"
+    text = table.read_text()
+    if new == "p02,nan":
+        lines = text.splitlines()
+        lines[3] = ",".join(["p02", "nan", *lines[3].split(",")[2:]])
+        text = "\n".join(lines)
+    elif old == ",near_z_m":
+        text = "\n".join(line.rsplit(",", 1)[0] for line in text.splitlines())
+    else:
+        text = text.replace(old, new)
+    table.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_corner_session(folder)
+    assert "positions.csv" in str(caught.value)
+
+
+def test_a_wrong_key_in_the_description_is_named(folder: Path) -> None:
+    file = folder / "session.toml"
+    file.write_text(file.read_text().replace("world_sigma_m = 0.001", "world_sigma_mm = 1"))
+    with pytest.raises(InputError, match="world_sigma_mm"):
+        read_corner_session(folder)
+
+
+def test_a_session_is_not_overwritten(folder: Path) -> None:
+    with pytest.raises(InputError, match="already holds a session"):
+        write_corner_session(folder, read_corner_session(folder))
