@@ -20,7 +20,17 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "scan": ("lidarpose.cli.scan:scan", "Turn a sweep recording into a 3D cloud."),
     "pose": ("lidarpose.cli.pose:pose", "The LiDAR's pose at a turntable angle, with its standard deviations."),
 }
-_GROUPS: dict[str, tuple[str, dict[str, tuple[str, str]]]] = {}
+_GROUPS: dict[str, tuple[str, dict[str, tuple[str, str]]]] = {
+    "simulate": (
+        "Make up a session or recording with its truth beside it.",
+        {
+            "corners": (
+                "lidarpose.cli.simulate_corners:simulate_corners",
+                "A target of three faces moved from place to place before a 3D LiDAR.",
+            ),
+        },
+    ),
+}
 
 
 def build_app() -> App:

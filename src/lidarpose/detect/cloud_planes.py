@@ -130,10 +130,10 @@ def _local_planes(chosen: Float32Array) -> tuple[FloatArray, FloatArray, BoolArr
 
 
 def _noise_from_neighbourhoods(thickness: FloatArray) -> float:
-    """The noise across flat neighbourhoods: the median one, as most of a scene is flat."""
+    """The noise across flat neighbourhoods: of all, the thinnest fifth is flat almost surely."""
     if len(thickness) == 0:
         return MIN_SIGMA_M
-    return max(float(np.quantile(thickness, 0.5)), MIN_SIGMA_M)
+    return max(float(np.quantile(thickness, 0.2)), MIN_SIGMA_M)
 
 
 def _harvest(x: Float32Array, free: BoolArray, sample: _Sample, least: int, at_most: int) -> list[PlanePatch]:
@@ -240,7 +240,7 @@ def _largest_component(points: Float32Array, inside: BoolArray, plane: Plane) ->
         return result
     chosen = points[members]
     # A thinned subsample has gaps of its own: twice the spacing that its own number and extent give.
-    raster = _raster(chosen, plane, _cell_size(chosen, plane), 0)
+    raster = _raster(chosen, plane, _cell_size(chosen), 0)
     cells = raster.cells(chosen)
     occupied = np.bincount(cells[cells >= 0], minlength=raster.shape[0] * raster.shape[1]).reshape(raster.shape)
     labels, pieces = ndimage.label(occupied > 0, structure=np.ones((3, 3)))
@@ -253,18 +253,18 @@ def _largest_component(points: Float32Array, inside: BoolArray, plane: Plane) ->
     return result
 
 
-def _cell_size(chosen: Float32Array, plane: Plane) -> float:
-    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(chosen.T.astype(np.float64))), 0.0)) if len(chosen) > 3 else [0.0] * 3
-    area = 12.0 * float(spread[1] * spread[2])
-    return max(gap_m(chosen), 2.0 * float(np.sqrt(area / max(len(chosen), 1))))
+def _cell_size(chosen: Float32Array) -> float:
+    if len(chosen) < 4:
+        return gap_m(chosen)
+    variance = np.maximum(np.linalg.eigvalsh(np.cov(chosen.T.astype(np.float64))), 0.0)
+    area = 12.0 * float(np.sqrt(variance[1] * variance[2]))
+    return max(gap_m(chosen), 2.0 * float(np.sqrt(area / len(chosen))))
 
 
-def _refit(
-    x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, component: BoolArray
-) -> PlanePatch | None:
+def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, component: BoolArray) -> PlanePatch | None:
     """The patch on the full cloud: free points near the plane in the cells that the component occupies."""
     seen = sample.points[component]
-    raster = _raster(seen, plane, _cell_size(seen, plane), 1)
+    raster = _raster(seen, plane, _cell_size(seen), 1)
     occupied = np.zeros(raster.shape[0] * raster.shape[1] + 1, dtype=bool)
     occupied[raster.cells(seen)] = True
     allowed = np.append(_grown(occupied[:-1].reshape(raster.shape)).ravel(), False)
@@ -285,9 +285,15 @@ def _refit(
     # A plane stands out from what is around it: a slab through scattered clutter does not.
     distance = x[near] @ plane.normal.astype(np.float32) - np.float32(plane.offset)
     around = int(np.count_nonzero(np.abs(distance) < 2.0 * GATE_SIGMAS * sigma_m))
-    if len(chosen) < 0.6 * around:
+    if len(chosen) < 0.6 * around or not _is_thin(x[chosen], sigma_m):
         return None
     return PlanePatch(plane, chosen, sigma_m)
+
+
+def _is_thin(points: Float32Array, sigma_m: float) -> bool:
+    """Whether points (M, 3) extend both ways well beyond their spread across."""
+    variance = np.linalg.eigvalsh(np.cov(points.T.astype(np.float64)))
+    return bool(sigma_m**2 < 0.35**2 * variance[1] and sigma_m**2 < 0.1**2 * variance[2])
 
 
 def _grown(occupied: BoolArray) -> BoolArray:

@@ -127,7 +127,7 @@ def _common_side(local: list[FloatArray], faces: list[PlanePatch]) -> bool | Non
 def _within_common_reach(points: FloatArray, local: list[FloatArray], corner: FloatArray) -> FloatArray:
     """Points no farther from the corner than the smallest face reaches: a wall's or the ground's rest is no target."""
     reach = min(float(np.quantile(np.linalg.norm(p - corner, axis=1), 0.98)) for p in local)
-    return points[np.linalg.norm(points - corner, axis=1) <= 1.3 * reach]
+    return np.asarray(points[np.linalg.norm(points - corner, axis=1) <= 1.3 * reach])
 
 
 def _outline(points: FloatArray, plane: Plane) -> FloatArray:
@@ -243,7 +243,7 @@ class FaceMask:
             for k in range(3):
                 if k != j:
                     # Distance from the common edge, along this face.
-                    sine = np.linalg.norm(np.cross(self.normals[j], self.normals[k]))
+                    sine = float(np.linalg.norm(np.cross(self.normals[j], self.normals[k])))
                     edge = np.abs((p - self.corner) @ self.normals[k]) / sine
                     good &= edge > self.margin_m
             for plane in self.obstacles:
