@@ -15,11 +15,12 @@ _MARK = ".lidarpose-part-"
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Give a temporary path in the same folder; on success it takes the place of `path`, else it is removed.
 
     The temporary name keeps the suffix, for writers that choose a format by it. The file is flushed to the disk
-    before the rename, so that a power cut leaves either the old file or the new one.
+    before the rename, so that a power cut leaves either the old file or the new one; not so with `durable` False,
+    for large files that can be made again (a killed process leaves the old or the new one all the same).
 
     Raises
     ------
@@ -35,7 +36,8 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary = path.with_name(f"{path.stem}{_MARK}{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
         try:
             yield temporary
-            _flush_to_disk(temporary)
+            if durable:
+                _flush_to_disk(temporary)
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)

@@ -105,7 +105,7 @@ def open_cloud_writer(
 @contextmanager
 def _open(path: Path, columns: Columns) -> Iterator[CloudWriter]:
     module = import_module(_format(path))
-    with replacing(path) as temporary, module.writer(temporary, columns, path) as writer:
+    with replacing(path, durable=False) as temporary, module.writer(temporary, columns, path) as writer:
         yield writer
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -18,8 +19,9 @@ from lidarpose.model.cloud import Cloud
 
 XYZ = ("x", "y", "z")
 RGB = ("red", "green", "blue")
-BLOCK_ROWS = 1 << 18
-"""Rows that are put together at a time when writing."""
+_is_little = sys.byteorder == "little"
+BLOCK_BYTES = 1 << 17
+"""Rows are put together and taken apart in blocks that stay in the cache; larger ones took twice the time."""
 
 
 class CloudWriter(Protocol):
@@ -57,17 +59,63 @@ class Columns:
 def write_rows(file: IO[bytes], columns: Columns, cloud: Cloud) -> None:
     """Append the cloud's rows to an open file, a block at a time."""
     columns.require_same(cloud)
-    if not columns.fields:
-        for block in _blocks(len(cloud)):
-            np.ascontiguousarray(cloud.points[block], dtype=columns.xyz.newbyteorder("<")).tofile(file)
+    row = columns.row()
+    if not columns.fields and cloud.points.dtype == columns.xyz and cloud.points.flags.c_contiguous and _is_little:
+        file.write(cloud.points.reshape(-1).view(np.uint8).data)
         return
-    rows = np.empty(min(len(cloud), BLOCK_ROWS), dtype=columns.row())
-    for block in _blocks(len(cloud)):
-        part = rows[: block.stop - block.start]
-        _coordinates(part, columns.xyz)[...] = cloud.points[block]
+    buffer = np.empty(_block_rows(row, len(cloud)), dtype=row)
+    for block in blocks(len(cloud), len(buffer)):
+        part = buffer[: block.stop - block.start]
+        points = cloud.points[block]
+        for axis, name in enumerate(XYZ):
+            part[name] = points[:, axis]
         for name in columns.fields:
             part[name] = cloud.fields[name][block]
-        part.tofile(file)
+        file.write(part.view(np.uint8).data)
+
+
+def read_rows(path: Path, offset: int, row: np.dtype[Any], count: int, *, skip: tuple[str, ...] = ()) -> Cloud:
+    """A cloud of `count` rows from a byte offset, a block at a time: the rows are never in memory as a whole.
+
+    Raises
+    ------
+    InputError
+        If x, y or z is missing, or fewer rows are there.
+    """
+    single = _require_coordinates(row, path)
+    if row.names == XYZ and row in (np.dtype([(name, kind) for name in XYZ]) for kind in ("<f4", "<f8")) and _is_little:
+        flat = np.fromfile(path, dtype=row["x"], count=3 * count, offset=offset)
+        _require_all(path, len(flat) // 3, count)
+        return Cloud(flat.reshape(-1, 3))
+    points = np.empty((count, 3), dtype=np.float32 if single else np.float64)
+    names = [name for name in row.names or () if name not in XYZ and name not in skip]
+    fields = {name: np.empty((count, *row[name].shape), row[name].base.newbyteorder("=")) for name in names}
+    buffer = np.empty(_block_rows(row, count), dtype=row)
+    with path.open("rb", buffering=0) as file:
+        file.seek(offset)
+        for block in blocks(count, len(buffer)):
+            part = buffer[: block.stop - block.start]
+            got = _fill(file, part.view(np.uint8).data)
+            _require_all(path, block.start + got // row.itemsize, count if got < part.nbytes else block.stop)
+            target = points[block]
+            for axis, name in enumerate(XYZ):
+                target[:, axis] = part[name]
+            for name, column in fields.items():
+                column[block] = part[name]
+    return Cloud(points, fields)
+
+
+def _fill(file: IO[bytes], target: memoryview) -> int:
+    """Read until `target` is full or the file ends; how many bytes came."""
+    got = 0
+    while got < len(target) and (more := file.readinto(target[got:])):  # type: ignore[attr-defined]
+        got += more
+    return got
+
+
+def _require_all(path: Path, found: int, promised: int) -> None:
+    if found != promised:
+        raise InputError(path, f"holds {found} points where its header promises {promised}", expected="all of them")
 
 
 def cloud_of_rows(rows: NDArray[Any], path: Path, *, skip: tuple[str, ...] = ()) -> Cloud:
@@ -78,7 +126,17 @@ def cloud_of_rows(rows: NDArray[Any], path: Path, *, skip: tuple[str, ...] = ())
     InputError
         If x, y or z is missing.
     """
-    names = rows.dtype.names or ()
+    single = _require_coordinates(rows.dtype, path)
+    points = np.empty((len(rows), 3), dtype=np.float32 if single else np.float64)
+    for axis, name in enumerate(XYZ):
+        points[:, axis] = rows[name]
+    names = [name for name in rows.dtype.names or () if name not in XYZ and name not in skip]
+    return Cloud(points, {name: _native(rows[name]) for name in names})
+
+
+def _require_coordinates(row: np.dtype[Any], path: Path) -> bool:
+    """InputError unless a row has x, y and z, one number each; True if all three are float32."""
+    names = row.names or ()
     missing = [name for name in XYZ if name not in names]
     if missing:
         raise InputError(
@@ -86,44 +144,23 @@ def cloud_of_rows(rows: NDArray[Any], path: Path, *, skip: tuple[str, ...] = ())
             f"has no {', '.join(missing)} among its fields ({', '.join(names) or 'none'})",
             expected="the fields x, y and z",
         )
-    if any(rows.dtype[name].shape or rows.dtype[name].kind not in "fiu" for name in XYZ):
+    if any(row[name].shape or row[name].kind not in "fiu" for name in XYZ):
         raise InputError(path, "has more than one number, or no number, in x, y or z", expected="one number each")
-    single = all(rows.dtype[name].base == rows[name].dtype and rows[name].dtype.itemsize == 4 for name in XYZ)
-    single = single and all(rows.dtype[name].kind == "f" for name in XYZ)
-    points = _stack_coordinates(rows, np.dtype(np.float32) if single else np.dtype(np.float64))
-    fields = {name: _native(rows[name]) for name in names if name not in XYZ and name not in skip}
-    return Cloud(points, fields)
-
-
-def _stack_coordinates(rows: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[np.floating[Any]]:
-    if rows.dtype.names == XYZ and rows.dtype == np.dtype([(name, dtype) for name in XYZ]):
-        return rows.view(dtype).reshape(-1, 3)  # nothing but coordinates: the rows are the points
-    points = np.empty((len(rows), 3), dtype=dtype)
-    for axis, name in enumerate(XYZ):
-        points[:, axis] = rows[name]
-    return points
+    return all(row[name].kind == "f" and row[name].itemsize == 4 for name in XYZ)
 
 
 def _native(column: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(column, dtype=column.dtype.newbyteorder("="))
 
 
-def _coordinates(rows: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """View (N, 3) on the x, y, z at the head of each row."""
-    return np.ndarray((len(rows), 3), dtype.newbyteorder("<"), rows, 0, (rows.dtype.itemsize, dtype.itemsize))
+def _block_rows(row: np.dtype[Any], count: int) -> int:
+    return max(1, min(count, BLOCK_BYTES // row.itemsize))
 
 
-def _blocks(count: int) -> Iterator[slice]:
-    for start in range(0, count, BLOCK_ROWS):
-        yield slice(start, min(start + BLOCK_ROWS, count))
-
-
-def read_rows(path: Path, offset: int, dtype: np.dtype[Any], count: int) -> NDArray[Any]:
-    """`count` rows from a byte offset; InputError if fewer are there."""
-    rows = np.fromfile(path, dtype=dtype, count=count, offset=offset)
-    if len(rows) != count:
-        raise InputError(path, f"holds {len(rows)} points where its header promises {count}", expected="all of them")
-    return rows
+def blocks(count: int, rows: int) -> Iterator[slice]:
+    """Slices of at most `rows` that cover `count`."""
+    for start in range(0, count, rows):
+        yield slice(start, min(start + rows, count))
 
 
 def parse_table(path: Path, file: IO[bytes], dtype: np.dtype[Any], count: int | None) -> NDArray[Any]:

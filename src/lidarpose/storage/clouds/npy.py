@@ -16,16 +16,16 @@ from numpy.lib import format as npy_format
 
 from lidarpose.errors import InputError
 from lidarpose.model.cloud import Cloud
-from lidarpose.storage.clouds.columns import Columns, cloud_of_rows, write_rows
+from lidarpose.storage.clouds.columns import Columns, read_rows, write_rows
 from lidarpose.storage.limits import file_size, require_bytes, require_count
 
 
 def read(path: Path) -> Cloud:
     """Read a cloud from an NPY file."""
-    shape, dtype = _read_header(path)
-    array = np.load(path, allow_pickle=False)
+    shape, dtype, offset = _read_header(path)
     if dtype.names is not None and len(shape) == 1:
-        return cloud_of_rows(array, path)
+        return read_rows(path, offset, dtype, shape[0])
+    array = np.load(path, allow_pickle=False)
     if dtype.names is None and dtype.kind in "fiu" and len(shape) == 2 and shape[1] >= 3:
         kept = np.float32 if dtype.kind == "f" and dtype.itemsize == 4 else np.float64
         fields = {f"column_{k + 1}": np.ascontiguousarray(array[:, k]) for k in range(3, shape[1])}
@@ -35,8 +35,8 @@ def read(path: Path) -> Cloud:
     )
 
 
-def _read_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type, after comparing them with the file's size."""
+def _read_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
+    """Shape, type and where the data start, after comparing them with the file's size."""
     with path.open("rb") as file:
         try:
             version = npy_format.read_magic(file)
@@ -57,7 +57,7 @@ def _read_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any]]:
     require_bytes(path, "shape", needed, file_size(path) - offset)
     if needed != file_size(path) - offset:
         raise InputError(path, "has more bytes than its array takes", field="shape", expected="one array alone")
-    return tuple(shape), dtype
+    return tuple(shape), dtype, offset
 
 
 @contextmanager

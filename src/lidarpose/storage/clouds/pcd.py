@@ -49,12 +49,12 @@ def read(path: Path) -> Cloud:
         # A number and a blank each: the least that the promised points can take.
         numbers = sum(int(np.prod(header.row[name].shape)) for name in header.row.names or ())
         require_bytes(path, "POINTS", header.points * numbers * 2 - 1, available)
-        rows = _read_ascii(path, header)
+        cloud = cloud_of_rows(_read_ascii(path, header), path, skip=header.padding)
     elif header.data == "binary":
-        rows = _read_binary(path, header, available)
+        cloud = _read_binary(path, header, available)
     else:
-        rows = _read_compressed(path, header, available)
-    return _unpack_colours(cloud_of_rows(rows, path, skip=header.padding))
+        cloud = cloud_of_rows(_read_compressed(path, header, available), path, skip=header.padding)
+    return _unpack_colours(cloud)
 
 
 def _read_header(path: Path) -> _Header:
@@ -126,11 +126,11 @@ def _read_ascii(path: Path, header: _Header) -> NDArray[Any]:
     return rows
 
 
-def _read_binary(path: Path, header: _Header, available: int) -> NDArray[Any]:
+def _read_binary(path: Path, header: _Header, available: int) -> Cloud:
     needed = header.points * header.row.itemsize
     require_bytes(path, "POINTS", needed, available)
     _require_padding(path, header.offset + needed)
-    return read_rows(path, header.offset, header.row, header.points)
+    return read_rows(path, header.offset, header.row, header.points, skip=header.padding)
 
 
 def _read_compressed(path: Path, header: _Header, available: int) -> NDArray[Any]:

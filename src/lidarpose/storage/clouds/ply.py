@@ -59,10 +59,8 @@ def read(path: Path) -> Cloud:
         raise InputError(path, "has a list among its properties", field="element vertex", expected="numbers alone")
     dtype = np.dtype([(name, (order or "=") + code) for name, code in vertex.properties])
     if order:
-        rows = _read_binary(path, offset, dtype, before, vertex, after, order)
-    else:
-        rows = _read_ascii(path, offset, dtype, before, vertex, after)
-    return cloud_of_rows(rows, path)
+        return _read_binary(path, offset, dtype, before, vertex, after)
+    return cloud_of_rows(_read_ascii(path, offset, dtype, before, vertex, after), path)
 
 
 def _read_header(path: Path) -> tuple[str, list[_Element], int]:
@@ -111,8 +109,7 @@ def _read_binary(
     before: list[_Element],
     vertex: _Element,
     after: list[_Element],
-    order: str,
-) -> NDArray[Any]:
+) -> Cloud:
     if lists := [element.name for element in before if element.has_list]:
         raise InputError(path, f"has lists in {lists[0]} before the vertices", expected="the vertices first")
     start = offset + sum(element.count * element.least_bytes for element in before)

@@ -17,10 +17,11 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.model.cloud import Cloud
-from lidarpose.storage.clouds.columns import BLOCK_ROWS, XYZ, Columns, cloud_of_rows, parse_table
+from lidarpose.storage.clouds.columns import XYZ, Columns, blocks, cloud_of_rows, parse_table
 from lidarpose.storage.limits import MAX_HEADER_BYTES
 
 _MAX_COLUMNS = 256
+_BLOCK_ROWS = 1 << 16
 _UNITS = re.compile(r"(_m|\[m\]|\(m\))$")
 
 
@@ -95,8 +96,7 @@ class _Writer:
         """Write the points of `cloud` after those before."""
         self._columns.require_same(cloud)
         formats = [_format(self._row[name].base) for name in self._row.names or ()]
-        for start in range(0, len(cloud), BLOCK_ROWS):
-            block = slice(start, start + BLOCK_ROWS)
+        for block in blocks(len(cloud), _BLOCK_ROWS):
             columns = [*cloud.points[block].T, *(cloud.fields[name][block] for name in self._columns.fields)]
             rows = np.empty(len(columns[0]), dtype=self._row)
             for name, column in zip(self._row.names or (), columns, strict=True):
