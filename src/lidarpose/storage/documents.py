@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -12,6 +13,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from lidarpose.errors import InputError
 
 MAX_DOCUMENT_BYTES = 16 * 2**20
+MAX_YAML_BYTES = 2**16
+"""Camera files have a few kB. The parser needs up to 2 s for 64 kB of the worst that can be written in YAML."""
 
 
 class Schema(BaseModel):
@@ -26,8 +29,9 @@ S = TypeVar("S", bound=BaseModel)
 def read_text(path: Path, what: str) -> str:
     """The text of a small UTF-8 file. Raises InputError if it is missing, too large, or not text."""
     try:
-        if path.is_dir() or not path.exists():
-            raise InputError(path, "is missing" if not path.exists() else "is a folder", expected=what)
+        if not path.is_file():
+            problem = "is missing" if not path.exists() else "is not a regular file"
+            raise InputError(path, problem, expected=what)
         if path.stat().st_size > MAX_DOCUMENT_BYTES:
             raise InputError(path, f"is larger than {MAX_DOCUMENT_BYTES // 2**20} MB", expected=what)
         return path.read_bytes().decode("utf-8-sig")
@@ -51,16 +55,70 @@ def read_yaml(path: Path) -> Any:
     from ruamel.yaml.error import YAMLError
 
     text = read_text(path, "a YAML file")
+    if len(text) > MAX_YAML_BYTES:
+        raise InputError(path, f"is larger than {MAX_YAML_BYTES // 2**10} kB", expected="a camera's YAML file")
     if text.startswith("%YAML:"):
         # OpenCV writes "%YAML:1.0", which no YAML parser takes for a directive.
         text = text.partition("\n")[2]
+    yaml = YAML(typ="safe", pure=True)
+    yaml.Constructor = _yaml_constructor()
     try:
-        return YAML(typ="safe", pure=True).load(text)
+        return yaml.load(text)
     except (YAMLError, ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
         first = next(iter(str(error).strip().splitlines()), "unreadable")
         mark = getattr(error, "problem_mark", None)
         field = f"line {mark.line + 1}" if mark is not None else None
         raise InputError(path, f"is not valid YAML: {first}", field=field) from error
+
+
+@cache
+def _yaml_constructor() -> Any:
+    """ruamel's safe constructor, to which OpenCV's matrices are mappings; every other tag is an error."""
+    from ruamel.yaml.constructor import SafeConstructor
+
+    class Constructor(SafeConstructor):  # type: ignore[misc, unused-ignore]
+        pass
+
+    Constructor.add_constructor("tag:yaml.org,2002:opencv-matrix", SafeConstructor.construct_yaml_map)
+    return Constructor
+
+
+def read_opencv_xml(path: Path) -> dict[str, Any]:
+    """OpenCV's FileStorage as XML: matrices as mappings with rows, cols and data, else numbers or text.
+
+    Document types and entities, which can expand without bounds or name other files, are refused.
+    """
+    from xml.etree import ElementTree
+
+    text = read_text(path, "an OpenCV XML file")
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise InputError(path, "has a document type", expected="plain XML without <!DOCTYPE and <!ENTITY")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(path, f"is not valid XML: {error}") from error
+    if root.tag != "opencv_storage":
+        raise InputError(path, f"starts with <{root.tag[:40]}>", expected="<opencv_storage>")
+    return {child.tag: _opencv_value(child) for child in root}
+
+
+def _opencv_value(element: Any) -> Any:
+    data = element.find("data")
+    if data is not None:
+        sizes = {key: _plain_value(element.findtext(key) or "") for key in ("rows", "cols")}
+        return {**sizes, "data": [_plain_value(word) for word in (data.text or "").split()]}
+    words = (element.text or "").split()
+    return _plain_value(words[0]) if len(words) == 1 else [_plain_value(word) for word in words]
+
+
+def _plain_value(word: str) -> int | float | str:
+    word = word.strip()
+    for kind in (int, float):
+        try:
+            return kind(word)
+        except ValueError:
+            continue
+    return word.strip('"')
 
 
 def read_json(path: Path) -> Any:

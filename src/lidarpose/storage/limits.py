@@ -16,8 +16,6 @@ MAX_HEADER_BYTES = 1 << 16
 """No text header of a cloud is longer; real ones have some hundred bytes."""
 MAX_POINTS = 1 << 36
 """A cloud of more points is a forged header: the largest scanners write some 10^10."""
-MAX_TEXT_BYTES = 16 << 20
-"""Of a text file that is parsed whole (settings, camera files, calibrations)."""
 
 
 def file_size(path: Path) -> int:
@@ -36,25 +34,6 @@ def file_size(path: Path) -> int:
     if not stat.S_ISREG(status.st_mode):
         raise InputError(path, "is not a regular file", expected="a file, not a folder, pipe or device")
     return status.st_size
-
-
-def read_text(path: Path, *, limit: int = MAX_TEXT_BYTES) -> str:
-    """The whole of a UTF-8 text file of at most `limit` bytes.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is longer, or is not UTF-8.
-    """
-    size = file_size(path)
-    if size > limit:
-        raise InputError(path, f"has {size} bytes", expected=f"a text file of at most {limit} bytes")
-    try:
-        return path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"is not text: byte {error.start} is not UTF-8", expected="a UTF-8 text file") from error
-    except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror or error}") from error
 
 
 def require_count(path: Path, field: str, count: int, limit: int = MAX_POINTS) -> int:

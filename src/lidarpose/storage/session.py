@@ -21,7 +21,7 @@ from lidarpose.model.image import ImageSource
 from lidarpose.model.scan import LidarSpec, Scan
 from lidarpose.model.session import DEFAULT_PLACEMENT, TurntablePlace, TurntableSession
 from lidarpose.model.targets import Panel
-from lidarpose.storage.camera_info import read_camera_info
+from lidarpose.storage.camera_files import read_camera
 from lidarpose.storage.documents import Schema, check_format, parse, read_toml
 from lidarpose.storage.images import FileImage
 from lidarpose.storage.tables import TextTable, read_number_table, read_text_table
@@ -101,7 +101,7 @@ def read_turntable_session(folder: Path, *, any_order: bool = False) -> Turntabl
         )
     document = parse(file, _SessionFile, check_format(file, read_toml(file), SESSION_FORMAT))
     panels = tuple(_panel(file, k, section) for k, section in enumerate(document.board.panels))
-    camera = read_camera_info(inside(folder, document.camera, file, "camera"))
+    camera = read_camera(inside(folder, document.camera, file, "camera"))
     places = _read_positions(folder, inside(folder, document.positions, file, "positions"), camera, any_order)
     board_images = _find_board_images(folder, file, document.board.images, camera, {p.placement for p in places})
     return TurntableSession(str(folder), camera, panels, board_images, places, document.lidar.spec())

@@ -1,0 +1,66 @@
+"""``lidarpose export``: a calibration for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from lidarpose.cli.options import FiniteFloat
+
+
+def export(
+    calibration: Path,
+    /,
+    *,
+    to: Literal["ros2", "urdf", "kalibr", "opencv", "csv"],
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    angle_deg: FiniteFloat | None = None,
+    camera: Path | None = None,
+    camera_frame: str = "camera_optical_frame",
+    turntable_frame: str = "turntable",
+    lidar_frame: str = "lidar",
+    world_frame: str = "world",
+) -> None:
+    """Write a calibration for ROS 2, URDF, Kalibr, OpenCV, or as a table of poses.
+
+    Parameters
+    ----------
+    calibration
+        A calibration file.
+    to
+        ros2: a launch file; urdf: a robot description with the turntable as a joint; kalibr: a camchain;
+        opencv: a FileStorage, XML if the output is named so, else YAML; csv: poses over angles.
+    output
+        The file to write.
+    angle_deg
+        The turntable's reading for which to write one pose. Without it: ros2 moves with the joint, csv has every
+        degree of a turn, kalibr and opencv hold the pose at 0 and the two transforms that give all others.
+    camera
+        A camera file whose intrinsics go into kalibr and opencv.
+    camera_frame
+        The name of the camera's optical frame (x right, y down, z forward).
+    turntable_frame
+        The name of the turntable's frame.
+    lidar_frame
+        The name of the LiDAR's frame.
+    world_frame
+        The name of the world's frame.
+    """
+    import math
+
+    from lidarpose.errors import InputError
+    from lidarpose.storage.calibration import read_calibration
+    from lidarpose.storage.camera_files import read_camera
+    from lidarpose.storage.exports import ExportOptions, FrameNames, write_export
+
+    loaded = read_calibration(calibration)
+    if camera is not None and to not in ("kalibr", "opencv"):
+        raise InputError("--camera", f"has no place in {to}", expected="--to kalibr or --to opencv")
+    options = ExportOptions(
+        angle_rad=None if angle_deg is None else math.radians(angle_deg),
+        camera=None if camera is None else read_camera(camera),
+        names=FrameNames(camera_frame, turntable_frame, lidar_frame, world_frame),
+    )
+    write_export(output, loaded, to, options)
