@@ -1,0 +1,125 @@
+"""Normal equations: moments of lines, random effects taken out, and damped steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarpose.geometry.arrays import FloatArray, IntArray
+
+SQRT3 = float(np.sqrt(3.0))
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """``information @ step = gradient``, and the weighted sum of squares at step 0."""
+
+    information: FloatArray
+    gradient: FloatArray
+    sum_of_squares: float
+
+    def solve(self, damping: float) -> FloatArray:
+        """The step of Levenberg and Marquardt, with the diagonal's scale (More, 1978)."""
+        diagonal = np.diag(self.information).copy()
+        scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
+        scaled = self.information * scale[:, None] * scale[None, :]
+        scaled[np.diag_indices_from(scaled)] += damping + (diagonal <= 0.0)
+        return np.asarray(scale * np.linalg.lstsq(scaled, scale * self.gradient, rcond=1e-14)[0])
+
+
+def line_moments(basis: FloatArray, along: FloatArray, residual: FloatArray, weight: FloatArray, start: IntArray) -> FloatArray:
+    """Weighted second moments (S, b + 3, b + 3) of (basis, 1, sqrt(3) along, residual), one matrix a line.
+
+    `basis` (N, b), `along`, `residual`, `weight` (N,); `start` (S + 1,) tells where lines begin. The two columns before
+    the residual are what a line may be off by as a whole: a shift and a slope, both of mean square 1.
+    """
+    root = np.sqrt(weight)[:, None]
+    one = np.ones((len(residual), 1))
+    rows = root * np.concatenate([basis, one, SQRT3 * along[:, None], residual[:, None]], axis=1)
+    out = np.empty((len(start) - 1, rows.shape[1], rows.shape[1]))
+    for j in range(len(out)):
+        block = rows[start[j] : start[j + 1]]
+        out[j] = block.T @ block
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class LineEffects:
+    """What lines are off by as a whole, best linear prediction.
+
+    Attributes
+    ----------
+    shrink : (S, 2, 2)
+        Posterior covariance Q of a line's shift and slope, the parameters held.
+    predicted : (S, 2)
+        Shift and slope.
+    coupling : (S, 2, b)
+        Moments of the two with the basis.
+    """
+
+    shrink: FloatArray
+    predicted: FloatArray
+    coupling: FloatArray
+
+
+def take_out_effects(moments: FloatArray, variance: float) -> tuple[FloatArray, LineEffects]:
+    """Moments (S, b + 1, b + 1) of basis and residual with each line's shift and slope integrated out.
+
+    Both are normal with mean 0 and the given variance (zero: there are none). This is the Schur complement of the
+    mixed model's equations (Henderson, 1950), the same as weighting with the full covariance of the line's rows.
+    """
+    S, size, _ = moments.shape
+    keep = [*range(size - 3), size - 1]
+    inner = moments[:, size - 3 : size - 1, size - 3 : size - 1]
+    coupling = moments[:, size - 3 : size - 1, :][:, :, keep]
+    reduced = moments[:, keep, :][:, :, keep]
+    if variance <= 0.0:
+        return reduced, LineEffects(np.zeros((S, 2, 2)), np.zeros((S, 2)), coupling[:, :, :-1])
+    shrink = np.linalg.inv(inner + np.eye(2) / variance)
+    reduced = reduced - np.swapaxes(coupling, 1, 2) @ shrink @ coupling
+    predicted = (shrink @ coupling[:, :, -1:])[:, :, 0]
+    return reduced, LineEffects(shrink, predicted, coupling[:, :, :-1])
+
+
+def add_lines(
+    reduced: FloatArray,
+    to_parameters: FloatArray,
+    slot: IntArray,
+    n_global: int,
+    into: tuple[FloatArray, FloatArray],
+) -> float:
+    """Add lines' normal equations to (information, gradient); return their weighted sum of squares.
+
+    `to_parameters` (S, b, n_global + 6): the last six columns are of the panel `slot` (S,).
+    """
+    information, gradient = into
+    if not len(reduced):
+        return 0.0
+    local = np.swapaxes(to_parameters, 1, 2) @ reduced[:, :-1, :-1] @ to_parameters
+    slope = -(np.swapaxes(to_parameters, 1, 2) @ reduced[:, :-1, -1:])[:, :, 0]
+    information[:n_global, :n_global] += local[:, :n_global, :n_global].sum(axis=0)
+    gradient[:n_global] += slope[:, :n_global].sum(axis=0)
+    for k in np.unique(slot):
+        mine = slot == k
+        at = slice(n_global + 6 * int(k), n_global + 6 * int(k) + 6)
+        cross = local[mine][:, :n_global, n_global:].sum(axis=0)
+        information[:n_global, at] += cross
+        information[at, :n_global] += cross.T
+        information[at, at] += local[mine][:, n_global:, n_global:].sum(axis=0)
+        gradient[at] += slope[mine][:, n_global:].sum(axis=0)
+    return float(reduced[:, -1, -1].sum())
+
+
+def covariance_and_condition(information: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+    """Inverse, condition number of the matrix scaled to a unit diagonal, and the least determined direction.
+
+    A direction without information gets the (huge, finite) variance of the smallest eigenvalue that rounding allows.
+    """
+    diagonal = np.diag(information)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
+    floor = 1e-15 * max(float(values[-1]), 1e-300)
+    safe = np.maximum(values, floor)
+    root = scale[:, None] * vectors / np.sqrt(safe)
+    return root @ root.T, float(safe[-1] / safe[0]), np.asarray(scale * vectors[:, 0])

@@ -1,0 +1,73 @@
+"""Noise from residuals: a redescending loss that is Gaussian in its core, and scales that stay right under it."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.robust import mad_sigma
+
+CORE = 2.5
+"""Residuals up to this many standard deviations count in full ..."""
+REJECT = 5.0
+"""... and beyond this many not at all; in between the weight falls as a raised cosine."""
+
+
+def taper_weights(standardised: FloatArray) -> FloatArray:
+    """Weights (N,) of residuals in units of sigma, in the manner of Hampel's three-part loss: 99.7 % efficient."""
+    z = np.clip((np.abs(standardised) - CORE) / (REJECT - CORE), 0.0, 1.0)
+    return np.asarray(0.5 * (1.0 + np.cos(np.pi * z)))
+
+
+@cache
+def gaussian_moments() -> tuple[float, float, float]:
+    """Under a standard normal: the share of weights above zero, E[psi^2] and E[psi'] of `taper_weights`."""
+    z = np.linspace(-8.0, 8.0, 160001)
+    density = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) * (z[1] - z[0])
+    psi = z * taper_weights(z)
+    inside = np.abs(z) < REJECT
+    return float(density[inside].sum()), float((density * psi**2).sum()), float((density * np.gradient(psi, z)).sum())
+
+
+def robust_scale(standardised: FloatArray, parameters: float) -> tuple[float, FloatArray]:
+    """Standard deviation of residuals (N,) that should have mean 0 and variance 1, and their weights at that scale.
+
+    Starts from the median absolute deviation; then the mean of psi^2 over what is not rejected is what it would be
+    for a normal distribution, less the degrees of freedom that `parameters` took.
+    """
+    n = len(standardised)
+    if n == 0:
+        return 1.0, np.zeros(0)
+    share, psi_square, _ = gaussian_moments()
+    scale = max(mad_sigma(standardised, centred=True), 1e-12)
+    for _ in range(6):
+        weight = taper_weights(standardised / scale)
+        used = np.count_nonzero(weight > 0.0)
+        freedom = max(used * (1.0 - parameters / n), 1.0)
+        square = float(((weight * standardised) ** 2).sum()) * share / psi_square / freedom
+        new = max(float(np.sqrt(square)), 1e-12)
+        done = abs(new / scale - 1.0) < 1e-4
+        scale = new
+        if done:
+            break
+    return scale, taper_weights(standardised / scale)
+
+
+def information_correction(standardised: FloatArray, weight: FloatArray) -> float:
+    """By what the information of weighted least squares is to be multiplied for the loss that was really used.
+
+    The asymptotic variance of an M-estimate is E[psi^2] / E[psi']^2 (Huber, *Robust Statistics*, section 7.6); weighted
+    least squares alone states 1 / E[weight].
+    """
+    if not len(standardised) or not weight.any():
+        return 1.0
+    z = np.abs(standardised)
+    psi = weight * standardised
+    t = np.clip((z - CORE) / (REJECT - CORE), 0.0, 1.0)
+    slope = weight - np.where((t > 0.0) & (t < 1.0), 0.5 * np.pi * z / (REJECT - CORE) * np.sin(np.pi * t), 0.0)
+    square, bend, mean_weight = float((psi**2).mean()), float(slope.mean()), float(weight.mean())
+    if square <= 0.0 or bend <= 0.1:
+        return 1.0
+    return float(np.clip(bend**2 / (square * mean_weight), 0.3, 1.0))
