@@ -28,7 +28,9 @@ class NormalEquations:
         return np.asarray(scale * np.linalg.lstsq(scaled, scale * self.gradient, rcond=1e-14)[0])
 
 
-def line_moments(basis: FloatArray, along: FloatArray, residual: FloatArray, weight: FloatArray, start: IntArray) -> FloatArray:
+def line_moments(
+    basis: FloatArray, along: FloatArray, residual: FloatArray, weight: FloatArray, start: IntArray
+) -> FloatArray:
     """Weighted second moments (S, b + 3, b + 3) of (basis, 1, sqrt(3) along, residual), one matrix a line.
 
     `basis` (N, b), `along`, `residual`, `weight` (N,); `start` (S + 1,) tells where lines begin. The two columns before

@@ -1,9 +1,9 @@
 """The joint estimate of a turntable session: one robust maximum-likelihood solution over all places.
 
 Corners, stripe pixels and ranges together determine each panel's pose, the turntable's axis and the LiDAR's mounting.
-Gauss-Newton steps with damping, weights of a redescending loss, and variance components that are estimated along the way:
-one factor on the stated standard deviations a kind, and the variance of what whole lines are off by (see
-docs/methods-joint.md).
+Gauss-Newton steps with damping, weights of a redescending loss, and variance components that are estimated along the
+way: one factor on the stated standard deviations a kind, and the variance of what whole lines are off by
+(docs/methods-joint.md).
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lidarpose.errors import UndeterminedError
-from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.robust import huber_weights, mad_sigma
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.observation import TurntableObservations
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_result import Kind
 from lidarpose.refine.least_squares import (
+    SQRT3,
     LineEffects,
     NormalEquations,
     add_lines,
@@ -28,7 +29,8 @@ from lidarpose.refine.least_squares import (
     line_moments,
     take_out_effects,
 )
-from lidarpose.refine.noise import information_correction, robust_scale
+from lidarpose.refine.noise import information_correction, robust_scale, taper_weights
+from lidarpose.refine.place_effects import place_variance
 from lidarpose.refine.turntable_model import (
     EXTRAS,
     N_GLOBAL,
@@ -39,17 +41,17 @@ from lidarpose.refine.turntable_model import (
     LineResiduals,
     Lines,
     corner_residuals,
-    lay_out,
     range_residuals,
-    start_state,
     stripe_residuals,
+    thinned,
 )
+
+Moments = dict[Kind, FloatArray]
+"""By kind: `line_moments` (S, b + 3, b + 3)."""
 
 Start = tuple[TurntableMotion, Mapping[str, tuple[Pose | None, ...]]]
 
 _FOCAL = EXTRAS.index("focal_scale")
-_LINE_REJECT = 36.0
-"""A line whose shift and slope have this chi-square of two degrees of freedom (6 sigma) or more is left out."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ class Solution:
     at: Linearised
     noise: Noise
     equations: NormalEquations
-    active: FloatArray
+    active: IntArray
     covariance: FloatArray
     condition_number: float
     weakest: FloatArray
@@ -175,20 +177,48 @@ def solve_joint(data: JointData, start: JointState, options: JointOptions) -> So
     """
     _require_enough(data)
     active = active_parameters(data, options.estimate)
+    rows = len(data.stripes.pixels) + len(data.ranges.range_m)
+    state, spent = start, 0
+    if rows > 4 * _COARSE_ROWS * (data.stripes.lines.count + data.ranges.lines.count):
+        # Most of the way on few rows of each line; the last steps on all of them.
+        coarse = _iterate(thinned(data, _COARSE_ROWS), start, active, options.max_iterations, None)
+        state, spent = coarse.at.state, coarse.iterations
+    done = _iterate(data, state, active, options.max_iterations, coarse.noise if spent else None)
+    return _finish(data, done.at, done.noise, active, spent + done.iterations, done.converged)
+
+
+_COARSE_ROWS = 32
+
+
+@dataclass(frozen=True, eq=False)
+class _Progress:
+    at: Linearised
+    noise: Noise
+    iterations: int
+    converged: bool
+
+
+def _iterate(
+    data: JointData, start: JointState, active: IntArray, max_iterations: int, earlier: Noise | None
+) -> _Progress:
+    """Steps until neither parameters nor noise move. `earlier`: the noise of a nearly finished estimate."""
     at = linearise(data, start)
-    noise = first_noise(data, at)
-    damping, converged, iteration, calm = 1e-6, False, 0, 0
-    for iteration in range(1, options.max_iterations + 1):
-        equations = normal_equations(data, at, noise)
-        reduced = _restricted(equations, active)
-        at, damping, decrease = _damped_step(data, at, noise, reduced, active, damping)
+    noise = first_noise(data, at) if earlier is None else carried_over(data, at, earlier)
+    soft_until, least = (3, 6) if earlier is None else (0, 2)
+    damping, calm, iteration = 1e-6, 0, 0
+    moments = all_moments(data, at, noise)
+    for iteration in range(1, max_iterations + 1):
+        equations = _restricted(normal_equations(data, at, noise, moments), active)
+        at, moments, damping, decrease = _damped_step(data, at, noise, equations, active, damping)
         old = noise
-        noise = update_noise(data, at, noise, active, soft=iteration <= 3, with_places=iteration >= 3)
-        calm = calm + 1 if decrease < 1e-5 and _noise_change(old, noise) < 2e-3 else 0
-        if calm >= 2 and iteration > 5:
-            converged = True
-            break
-    return _finish(data, at, noise, active, iteration, converged)
+        noise = update_noise(
+            data, at, noise, moments, active, soft=iteration <= soft_until, with_places=iteration >= soft_until
+        )
+        moments = all_moments(data, at, noise)
+        calm = calm + 1 if decrease < 1e-4 and _noise_change(old, noise) < 2e-3 else 0
+        if calm >= (2 if earlier is None else 1) and iteration >= least:
+            return _Progress(at, noise, iteration, True)
+    return _Progress(at, noise, iteration, False)
 
 
 def _require_enough(data: JointData) -> None:
@@ -204,36 +234,37 @@ def _require_enough(data: JointData) -> None:
         )
 
 
-def active_parameters(data: JointData, estimate: tuple[str, ...]) -> FloatArray:
+def active_parameters(data: JointData, estimate: tuple[str, ...]) -> IntArray:
     """Indices of the parameters that are estimated: ten, the chosen extras, six a panel."""
     extras = [N_MOTION + i for i, name in enumerate(EXTRAS) if name in estimate]
     panels = range(N_GLOBAL, N_GLOBAL + 6 * len(data.slots))
     return np.array([*range(N_MOTION), *extras, *panels])
 
 
-def _restricted(equations: NormalEquations, active: FloatArray) -> NormalEquations:
+def _restricted(equations: NormalEquations, active: IntArray) -> NormalEquations:
     return NormalEquations(
         equations.information[np.ix_(active, active)], equations.gradient[active], equations.sum_of_squares
     )
 
 
 def _damped_step(
-    data: JointData, at: Linearised, noise: Noise, equations: NormalEquations, active: FloatArray, damping: float
-) -> tuple[Linearised, float, float]:
-    """One accepted step, or none: the new point, the next damping, and how much the cost was to fall."""
+    data: JointData, at: Linearised, noise: Noise, equations: NormalEquations, active: IntArray, damping: float
+) -> tuple[Linearised, Moments, float, float]:
+    """One accepted step, or none: the new point, its moments, the next damping, and how much the cost was to fall."""
     for _ in range(12):
         step = equations.solve(damping)
         full = np.zeros(N_GLOBAL + 6 * len(data.slots))
         full[active] = step
         expected = float(step @ equations.gradient)
         new = linearise(data, at.state.moved(full, data.centres))
-        cost = sum_of_squares(data, new, noise)
-        if cost <= equations.sum_of_squares * (1.0 + 1e-12) + 1e-9:
-            return new, max(damping * 0.1, 1e-12), expected
-        if expected < 1e-7 * max(1.0, equations.sum_of_squares * 1e-6):
-            return at, damping, 0.0
+        moments = all_moments(data, new, noise)
+        cost = sum_of_squares(data, new, noise, moments)
+        if cost <= equations.sum_of_squares * (1.0 + 1e-9) + 1e-9:
+            return new, moments, max(damping * 0.1, 1e-12), expected
+        if expected < 1e-6:
+            break
         damping = max(damping, 1e-9) * 10.0
-    return at, damping, 0.0
+    return at, all_moments(data, at, noise), damping, 0.0
 
 
 # --- normal equations -----------------------------------------------------------------------------------------------
@@ -243,12 +274,20 @@ def _row_weight(lines: Lines, residuals: LineResiduals, noise: LineNoise) -> Flo
     return np.asarray(np.where(residuals.valid, noise.row_weights / (lines.sigma * noise.factor) ** 2, 0.0))
 
 
-def _reduced_moments(lines: Lines, residuals: LineResiduals, noise: LineNoise) -> tuple[FloatArray, LineEffects]:
-    weight = _row_weight(lines, residuals, noise)
-    moments = line_moments(residuals.basis, lines.along, residuals.residual, weight, lines.start)
-    reduced, effects = take_out_effects(moments, noise.place_variance)
+def all_moments(data: JointData, at: Linearised, noise: Noise) -> Moments:
+    """Moments of all lines, by kind, at the noise as it is known."""
+    out: Moments = {}
+    for kind, residuals in at.lines.items():
+        lines = lines_of(data, kind)
+        weight = _row_weight(lines, residuals, noise.lines[kind])
+        out[kind] = line_moments(residuals.basis, lines.along, residuals.residual, weight, lines.start)
+    return out
+
+
+def reduced_moments(moments: FloatArray, noise: LineNoise) -> FloatArray:
+    reduced, _ = take_out_effects(moments, noise.place_variance)
     scale = noise.line_weights * noise.correction / noise.neighbour_factor
-    return reduced * scale[:, None, None], effects
+    return np.asarray(reduced * scale[:, None, None])
 
 
 def _corner_weight(data: JointData, noise: CornerNoise, k: int) -> FloatArray:
@@ -256,7 +295,7 @@ def _corner_weight(data: JointData, noise: CornerNoise, k: int) -> FloatArray:
     return np.asarray(noise.weights[k] * noise.correction / (sigma * noise.factor) ** 2)
 
 
-def normal_equations(data: JointData, at: Linearised, noise: Noise) -> NormalEquations:
+def normal_equations(data: JointData, at: Linearised, noise: Noise, moments: Moments) -> NormalEquations:
     """Of all parameters, active or not, at the noise as it is known."""
     n = N_GLOBAL + 6 * len(data.slots)
     information, gradient, total = np.zeros((n, n)), np.zeros(n), 0.0
@@ -267,24 +306,19 @@ def normal_equations(data: JointData, at: Linearised, noise: Noise) -> NormalEqu
         gradient[columns] -= corner.jacobian.T @ (weight * corner.residual)
         total += float(weight @ corner.residual**2)
     for kind, residuals in at.lines.items():
-        lines = lines_of(data, kind)
-        reduced, _ = _reduced_moments(lines, residuals, noise.lines[kind])
-        total += add_lines(reduced, residuals.to_parameters, lines.slot, N_GLOBAL, (information, gradient))
+        reduced = reduced_moments(moments[kind], noise.lines[kind])
+        slot = lines_of(data, kind).slot
+        total += add_lines(reduced, residuals.to_parameters, slot, N_GLOBAL, (information, gradient))
     return NormalEquations(information, gradient, total)
 
 
-def sum_of_squares(data: JointData, at: Linearised, noise: Noise) -> float:
+def sum_of_squares(data: JointData, at: Linearised, noise: Noise, moments: Moments) -> float:
     """The weighted sum of squares alone, for accepting a step."""
     total = 0.0
     for k, corner in enumerate(at.corners):
         total += float(_corner_weight(data, noise.corners, k) @ corner.residual**2)
-    for kind, residuals in at.lines.items():
-        lines, noise_of = lines_of(data, kind), noise.lines[kind]
-        weight = _row_weight(lines, residuals, noise_of)
-        moments = line_moments(np.zeros((len(weight), 0)), lines.along, residuals.residual, weight, lines.start)
-        reduced, _ = take_out_effects(moments, noise_of.place_variance)
-        scale = noise_of.line_weights * noise_of.correction / noise_of.neighbour_factor
-        total += float((reduced[:, 0, 0] * scale).sum())
+    for kind in at.lines:
+        total += float(reduced_moments(moments[kind], noise.lines[kind])[:, -1, -1].sum())
     return total
 
 
@@ -313,17 +347,48 @@ def _standardised_corners(data: JointData, at: Linearised) -> list[FloatArray]:
     return [c.residual / np.repeat(data.corners[k].sigma_px, 2) for k, c in enumerate(at.corners)]
 
 
+def carried_over(data: JointData, at: Linearised, earlier: Noise) -> Noise:
+    """The noise of an estimate on fewer rows, with weights for all rows."""
+    lines: dict[Kind, LineNoise] = {}
+    for kind, residuals in at.lines.items():
+        layout, known = lines_of(data, kind), earlier.lines[kind]
+        weights = np.ones(len(residuals.residual))
+        rough = replace(known, row_weights=weights)
+        moments = line_moments(
+            residuals.basis, layout.along, residuals.residual, _row_weight(layout, residuals, rough), layout.start
+        )
+        _, effects = take_out_effects(moments, known.place_variance)
+        z = _without_effects(layout, residuals, effects) / (layout.sigma * known.factor)
+        lines[kind] = replace(known, row_weights=taper_weights(z))
+    return Noise(earlier.corners, lines)
+
+
+def _without_effects(lines: Lines, residuals: LineResiduals, effects: LineEffects) -> FloatArray:
+    """Residuals (N,) less the predicted shift and slope of their lines."""
+    shift = effects.predicted[lines.line_of_row]
+    return np.asarray(residuals.residual - shift[:, 0] - SQRT3 * lines.along * shift[:, 1])
+
+
 def update_noise(
-    data: JointData, at: Linearised, noise: Noise, active: FloatArray, *, soft: bool, with_places: bool
+    data: JointData,
+    at: Linearised,
+    noise: Noise,
+    moments: Moments,
+    active: IntArray,
+    *,
+    soft: bool,
+    with_places: bool,
 ) -> Noise:
-    """New factors, place variances and weights at the present residuals."""
-    information = normal_equations(data, at, noise).information[np.ix_(active, active)]
+    """New factors, place variances and weights at the present residuals; `moments` are those of the old noise."""
+    information = normal_equations(data, at, noise, moments).information[np.ix_(active, active)]
     covariance, _, _ = covariance_and_condition(information)
     full = np.zeros((N_GLOBAL + 6 * len(data.slots),) * 2)
     full[np.ix_(active, active)] = covariance
     lines: dict[Kind, LineNoise] = {}
     for kind, residuals in at.lines.items():
-        lines[kind] = _update_lines(lines_of(data, kind), residuals, noise.lines[kind], full, soft, with_places)
+        lines[kind] = _update_lines(
+            lines_of(data, kind), residuals, noise.lines[kind], moments[kind], full, soft, with_places
+        )
     return Noise(_update_corners(data, at, noise.corners, full, soft), lines)
 
 
@@ -348,20 +413,24 @@ def _update_corners(
 
 
 def _update_lines(
-    lines: Lines, residuals: LineResiduals, noise: LineNoise, covariance: FloatArray, soft: bool, with_places: bool
+    lines: Lines,
+    residuals: LineResiduals,
+    noise: LineNoise,
+    moments: FloatArray,
+    covariance: FloatArray,
+    soft: bool,
+    with_places: bool,
 ) -> LineNoise:
-    weight = _row_weight(lines, residuals, noise)
-    moments = line_moments(residuals.basis, lines.along, residuals.residual, weight, lines.start)
     spread = _parameter_spread(residuals, lines, moments, covariance)
-    place_variance, line_weights = 0.0, np.ones(lines.count)
+    variance = 0.0
+    line_weights: FloatArray = np.ones(lines.count)
     if with_places:
-        place_variance, line_weights = _place_variance(moments, spread, noise.line_weights)
-    reduced, effects = take_out_effects(moments, place_variance)
-    shift = effects.predicted[lines.line_of_row]
-    own = residuals.residual - shift[:, 0] - np.sqrt(3.0) * lines.along * shift[:, 1]
+        variance, line_weights = place_variance(moments, spread)
+    reduced, effects = take_out_effects(moments, variance)
+    own = _without_effects(lines, residuals, effects)
     use = residuals.valid & (line_weights[lines.line_of_row] > 0.0)
-    paid = float(np.einsum("sij,sij->", reduced[:, :-1, :-1], spread.of_basis))
-    paid += _effect_freedom(effects, place_variance)
+    paid = float(np.einsum("sij,sij->", reduced[:, :-1, :-1], spread))
+    paid += _effect_freedom(effects, variance)
     z = own / lines.sigma
     factor, used_weights = robust_scale(z[use], min(paid, 0.5 * use.sum()))
     factor = _floor(factor)
@@ -370,26 +439,20 @@ def _update_lines(
     dropped = residuals.valid & ~use
     row_weights[dropped] = huber_weights(z[dropped] / factor)
     correction = 1.0 if soft else information_correction(z[use] / factor, used_weights)
-    return LineNoise(factor, place_variance, row_weights, line_weights, correction)
-
-
-@dataclass(frozen=True, eq=False)
-class _Spread:
-    """What the parameters' uncertainty does to lines: covariance (S, b, b) of the basis' coefficients."""
-
-    of_basis: FloatArray
+    return LineNoise(factor, variance, row_weights, line_weights, correction)
 
 
 def _parameter_spread(
     residuals: LineResiduals, lines: Lines, moments: FloatArray, covariance: FloatArray
-) -> _Spread:
+) -> FloatArray:
+    """What the parameters' uncertainty does to lines: covariance (S, b, b) of the basis' coefficients."""
     out = np.empty((lines.count, residuals.basis.shape[1], residuals.basis.shape[1]))
     for k in np.unique(lines.slot):
         mine = lines.slot == k
         index = np.array([*range(N_GLOBAL), *range(N_GLOBAL + 6 * k, N_GLOBAL + 6 * k + 6)])
         to = residuals.to_parameters[mine]
         out[mine] = to @ covariance[np.ix_(index, index)] @ np.swapaxes(to, 1, 2)
-    return _Spread(out)
+    return out
 
 
 def _effect_freedom(effects: LineEffects, variance: float) -> float:
@@ -397,71 +460,6 @@ def _effect_freedom(effects: LineEffects, variance: float) -> float:
     if variance <= 0.0:
         return 0.0
     return float(2.0 * len(effects.shrink) - np.trace(effects.shrink, axis1=1, axis2=2).sum() / variance)
-
-
-def _place_variance(moments: FloatArray, spread: _Spread, line_weights: FloatArray) -> tuple[float, FloatArray]:
-    """The variance of lines' shifts and slopes beyond what their rows' scatter explains, and the lines' weights.
-
-    Each line's own least-squares shift and slope (2 numbers) has the covariance V + variance * I, V from the rows; the
-    parameters have absorbed part of it (redundancy). Estimated by Fisher scoring of the restricted likelihood with what
-    the parameters absorbed taken as shared out evenly; set to zero unless it is significant at the 5 % level.
-    """
-    from scipy.stats import chi2
-
-    S, size, _ = moments.shape
-    inner = moments[:, size - 3 : size - 1, size - 3 : size - 1]
-    good = np.linalg.det(inner) > 1e-12 * np.maximum(inner[:, 0, 0], 1e-300) ** 2
-    if good.sum() < 3:
-        return 0.0, np.ones(S)
-    V = np.linalg.inv(np.where(good[:, None, None], inner, np.eye(2)))
-    coupling = moments[:, size - 3 : size - 1, :]
-    own = (V @ coupling[:, :, -1:])[:, :, 0]
-    absorbed = V @ coupling[:, :, : size - 3]
-    absorbed = absorbed @ spread.of_basis @ np.swapaxes(absorbed, 1, 2)
-    variance = _robust_start(own[good], V[good])
-    weights = np.ones(S)
-    for _ in range(30):
-        total = V + variance * np.eye(2)
-        inverse = np.linalg.inv(total)
-        square = np.einsum("si,sij,sj->s", own, inverse, own)
-        out = good & (square > _LINE_REJECT)
-        # More than a quarter of the lines cannot all be the odd ones out: then the model is wrong, not they.
-        if out.sum() > 0.25 * good.sum():
-            out[np.argsort(square)[: -max(int(0.25 * good.sum()), 1)]] = False
-        use = good & ~out
-        weights = np.where(out, 0.0, 1.0)
-        freedom = np.maximum(2.0 - np.einsum("sij,sji->s", inverse, absorbed), 0.0)
-        if variance == 0.0:
-            threshold = float(chi2.ppf(0.95, max(freedom[use].sum(), 1.0)))
-            if square[use].sum() <= threshold:
-                return 0.0, weights
-        score = float((np.einsum("si,si->s", (inverse @ own[:, :, None])[:, :, 0], (inverse @ own[:, :, None])[:, :, 0])[use]).sum())
-        trace = np.trace(inverse, axis1=1, axis2=2)
-        share = freedom / 2.0
-        fisher = float(np.einsum("sij,sji->s", inverse, inverse)[use].sum())
-        change = (score - float((trace * share)[use].sum())) / max(fisher, 1e-300)
-        new = max(variance + change, 0.0)
-        if abs(new - variance) <= 1e-4 * max(variance, 1e-300):
-            variance = new
-            break
-        variance = new
-        if variance == 0.0:
-            break
-    if variance > 0.0:
-        inverse = np.linalg.inv(V)
-        use = good & (weights > 0.0)
-        square = np.einsum("si,sij,sj->s", own, inverse, own)[use].sum()
-        freedom = np.maximum(2.0 - np.einsum("sij,sji->s", inverse, absorbed), 0.0)[use].sum()
-        if square <= float(chi2.ppf(0.95, max(freedom, 1.0))):
-            variance = 0.0
-    return variance, weights
-
-
-def _robust_start(own: FloatArray, V: FloatArray) -> float:
-    """From the median of the squared standardised shifts, whose value for pure noise is 1.386 (chi-square, 2)."""
-    square = np.einsum("si,sij,sj->s", own, np.linalg.inv(V), own)
-    ratio = float(np.median(square)) / 1.3862943611
-    return max(ratio - 1.0, 0.0) * float(np.median(np.trace(V, axis1=1, axis2=2))) / 2.0
 
 
 def _noise_change(a: Noise, b: Noise) -> float:
@@ -477,8 +475,8 @@ def _noise_change(a: Noise, b: Noise) -> float:
 
 
 def _finish(
-    data: JointData, at: Linearised, noise: Noise, active: FloatArray, iterations: int, converged: bool
+    data: JointData, at: Linearised, noise: Noise, active: IntArray, iterations: int, converged: bool
 ) -> Solution:
-    equations = normal_equations(data, at, noise)
+    equations = normal_equations(data, at, noise, all_moments(data, at, noise))
     covariance, condition, weakest = covariance_and_condition(equations.information[np.ix_(active, active)])
     return Solution(data, at, noise, equations, active, covariance, condition, weakest, iterations, converged)

@@ -20,7 +20,7 @@ import numpy as np
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.se3 import Pose, skew
 from lidarpose.model.camera import Camera
-from lidarpose.model.observation import LeftOut, PanelCorners, TurntableObservations
+from lidarpose.model.observation import LeftOut, PanelCorners, ScanLine, StripePoints, TurntableObservations
 from lidarpose.model.turntable import TurntableMotion
 
 EXTRAS = (
@@ -32,8 +32,9 @@ EXTRAS = (
     "focal_scale",
 )
 """Further parameters, each zero where it is not estimated (scales are the excess over 1):
-true angle = (1 + encoder_scale) * reading; measured range = (1 + range_scale) * distance + range_offset_m + black_bias_m on
-black; true beam angle = (1 + beam_angle_scale) * stated one; true focal length = (1 + focal_scale) * stated one."""
+true angle = (1 + encoder_scale) * reading; measured range = (1 + range_scale) * distance + range_offset_m, and
+black_bias_m more on black; true beam angle = (1 + beam_angle_scale) * stated one; true focal length =
+(1 + focal_scale) * stated one."""
 
 N_MOTION = 10
 N_GLOBAL = N_MOTION + len(EXTRAS)
@@ -79,7 +80,7 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class StripeRows:
-    """Stripe pixels as rays: direction (z = 1), and its derivatives by a pixel across the stripe and by the focal scale."""
+    """Stripe pixels as rays (z = 1), with their derivatives by a pixel across the stripe and by the focal scale."""
 
     lines: Lines
     pixels: FloatArray
@@ -87,6 +88,11 @@ class StripeRows:
     rays: FloatArray
     ray_per_px: FloatArray
     ray_per_focal: FloatArray
+
+    @property
+    def ray_size_px(self) -> FloatArray:
+        """Length (N,) of the ray's derivative by a pixel."""
+        return np.asarray(np.linalg.norm(self.ray_per_px, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,6 +264,31 @@ def lay_out(observations: TurntableObservations, *, use_stripes: bool = True) ->
     )
 
 
+def thinned(data: JointData, rows_a_line: int) -> JointData:
+    """The same with at most so many rows of each line, evenly spread."""
+    stripes, ranges = data.stripes, data.ranges
+    s_keep, s_lines = _thin_lines(stripes.lines, rows_a_line)
+    r_keep, r_lines = _thin_lines(ranges.lines, rows_a_line)
+    return replace(
+        data,
+        stripes=StripeRows(
+            s_lines,
+            *(getattr(stripes, n)[s_keep] for n in ("pixels", "normals", "rays", "ray_per_px", "ray_per_focal")),
+        ),
+        ranges=RangeRows(r_lines, *(getattr(ranges, n)[r_keep] for n in ("angle_rad", "range_m", "darkness"))),
+    )
+
+
+def _thin_lines(lines: Lines, rows_a_line: int) -> tuple[IntArray, Lines]:
+    keep = [np.zeros(0, dtype=np.int64)]
+    for a, b in zip(lines.start[:-1], lines.start[1:], strict=True):
+        n = min(int(b - a), rows_a_line)
+        keep.append(a + (np.arange(n) * (b - a)) // max(n, 1))
+    index = np.concatenate(keep)
+    start = np.cumsum([len(k) for k in keep], dtype=np.int64)
+    return index, Lines(lines.place, lines.slot, start, lines.along[index], lines.sigma[index])
+
+
 def _slots(observations: TurntableObservations) -> tuple[Slot, ...]:
     used = {(p.placement, k) for p in observations.places for k in (*p.stripes, *p.scan_lines)}
     return tuple(
@@ -284,13 +315,11 @@ def _lines(items: list[tuple[int, int, FloatArray, FloatArray]]) -> Lines:
     )
 
 
-def _stripe_rows(camera: Camera, items: list[tuple[int, int, object]]) -> StripeRows:
-    from lidarpose.model.observation import StripePoints
-
+def _stripe_rows(camera: Camera, items: list[tuple[int, int, StripePoints]]) -> StripeRows:
     kept: list[tuple[int, int, FloatArray, FloatArray]] = []
-    pixels, normals = [np.zeros((0, 2))], [np.zeros((0, 2))]
+    pixels: list[FloatArray] = [np.zeros((0, 2))]
+    normals: list[FloatArray] = [np.zeros((0, 2))]
     for place, slot, stripe in items:
-        assert isinstance(stripe, StripePoints)
         good = np.isfinite(stripe.pixels).all(1) & np.isfinite(stripe.normals).all(1) & (stripe.sigma_px > 0.0)
         good &= np.isfinite(stripe.sigma_px)
         if good.sum() < 2:
@@ -306,7 +335,7 @@ def _stripe_rows(camera: Camera, items: list[tuple[int, int, object]]) -> Stripe
 def stripe_rays(camera: Camera, lines: Lines, pixels: FloatArray, normals: FloatArray) -> StripeRows:
     """The rays of stripe pixels; pixels outside the distortion model's valid region get a direction without weight."""
     ideal = camera.undistort(pixels)
-    lost = ~np.isfinite(ideal).all(axis=1)
+    lost = np.asarray(~np.isfinite(ideal).all(axis=1))
     ideal = np.where(lost[:, None], 0.0, ideal)
     rays = np.column_stack([ideal, np.ones(len(ideal))])
     _, J = camera.project_with_jacobian(rays) if len(rays) else (None, np.zeros((0, 2, 3)))
@@ -319,13 +348,12 @@ def stripe_rays(camera: Camera, lines: Lines, pixels: FloatArray, normals: Float
     return StripeRows(lines, pixels, normals, rays, np.hstack([per_px, flat]), np.hstack([per_focal, flat]))
 
 
-def _range_rows(items: list[tuple[int, int, object]], has_intensity: bool) -> RangeRows:
-    from lidarpose.model.observation import ScanLine
-
+def _range_rows(items: list[tuple[int, int, ScanLine]], has_intensity: bool) -> RangeRows:
     kept: list[tuple[int, int, FloatArray, FloatArray]] = []
-    angles, ranges, intensities = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+    angles: list[FloatArray] = [np.zeros(0)]
+    ranges: list[FloatArray] = [np.zeros(0)]
+    intensities: list[FloatArray] = [np.zeros(0)]
     for place, slot, line in items:
-        assert isinstance(line, ScanLine)
         good = np.isfinite(line.angle_rad) & np.isfinite(line.range_m) & (line.range_m > 0.0)
         good &= np.isfinite(line.sigma_m) & (line.sigma_m > 0.0)
         if good.sum() < 2:
@@ -340,7 +368,7 @@ def _range_rows(items: list[tuple[int, int, object]], has_intensity: bool) -> Ra
 
 
 def _darkness(intensity: FloatArray) -> FloatArray:
-    """0 for the brighter of two classes of beams, 1 for the darker, in between by interpolation (Otsu's threshold)."""
+    """0 for the brighter of two classes of beams (Otsu's threshold), 1 for the darker; in between for mixed ones."""
     finite = np.isfinite(intensity)
     if finite.sum() < 10:
         return np.zeros(len(intensity))
@@ -350,9 +378,10 @@ def _darkness(intensity: FloatArray) -> FloatArray:
     count = np.arange(1, n)
     between = (below / count - (below[-1] + values[-1] - below) / (n - count)) ** 2 * count * (n - count)
     cut = int(np.argmax(between)) + 1
-    dark, bright = float(np.median(values[:cut])), float(np.median(values[cut:]))
+    # Within a class brightness still varies with distance and slant; only what lies between the classes is mixed.
+    dark, bright = float(np.quantile(values[:cut], 0.95)), float(np.quantile(values[cut:], 0.05))
     if not bright > dark:
-        return np.zeros(len(intensity))
+        return np.asarray(np.where(finite, intensity < values[cut], 0.0))
     return np.asarray(np.where(finite, np.clip((bright - intensity) / (bright - dark), 0.0, 1.0), 0.0))
 
 
@@ -363,8 +392,8 @@ def _darkness(intensity: FloatArray) -> FloatArray:
 class LineResiduals:
     """Residuals (N,) of lines of one kind, the basis of their derivatives, and how it maps to the parameters.
 
-    ``d residual = basis @ to_parameters[line] @ step``: basis (N, b), to_parameters (S, b, N_GLOBAL + 6), whose last six
-    columns are of the line's own panel.
+    ``d residual = basis @ to_parameters[line] @ step``: basis (N, b), to_parameters (S, b, N_GLOBAL + 6), whose last
+    six columns are of the line's own panel.
     """
 
     residual: FloatArray
@@ -444,30 +473,32 @@ def stripe_residuals(data: JointData, state: JointState) -> LineResiduals:
     of_row = lines.line_of_row
     R_place, t_place, J_place = state.turned(data.angles_rad, data.reference_rad)
     R_panel, t_panel, map_panel = _panel_geometry(data, state)
-    rays, per_px = rows.rays, rows.ray_per_px
     if state.extras[_FOCAL - N_MOTION] != 0.0:
         camera = focal_scaled(data.camera, float(state.extras[_FOCAL - N_MOTION]))
         rows = stripe_rays(camera, lines, rows.pixels, rows.normals)
-        rays, per_px = rows.rays, rows.ray_per_px
-    slot, place = lines.slot[of_row], lines.place[of_row]
-    n, m = R_panel[slot, :, 2], R_place[place, :, 2]
-    offset = np.einsum("ki,ki->k", R_panel[:, :, 2], t_panel)[slot]
-    ray_n, ray_m = _dot(rays, n), _dot(rays, m)
+    offset = np.einsum("ki,ki->k", R_panel[:, :, 2], t_panel)[lines.slot][of_row]
+    height = np.einsum("mi,mi->m", R_place[:, :, 2], t_place)[lines.place][of_row]
+    ray_n, ray_m, px_n, px_m, focal_n, focal_m, ray_x, ray_y = _stripe_products(
+        rows, R_panel[lines.slot], R_place[lines.place][:, :, 2]
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = offset / ray_n
-        points = depth[:, None] * rays
         alpha = ray_m / ray_n
-        distance = ray_m * depth - np.einsum("mi,mi->m", R_place[:, :, 2], t_place)[place]
-        per_pixel = depth * (_dot(m, per_px) - alpha * _dot(n, per_px))
-        per_focal = depth * (_dot(m, rows.ray_per_focal) - alpha * _dot(n, rows.ray_per_focal))
+        distance = ray_m * depth - height
+        per_pixel = depth * (px_m - alpha * px_n)
         inverse = 1.0 / per_pixel
     valid = np.isfinite(inverse) & np.isfinite(distance) & (depth > 0.0) & np.isfinite(lines.sigma)
-    valid &= np.abs(per_pixel) > 0.2 * depth * np.linalg.norm(per_px, axis=1) * 0.1
-    local = points - t_panel[slot]
-    X, Y = _dot(local, R_panel[slot, :, 0]), _dot(local, R_panel[slot, :, 1])
-    one = np.stack([np.ones_like(X), X, Y], axis=1) * inverse[:, None]
-    basis = np.concatenate([one, alpha[:, None] * one, (per_focal * inverse)[:, None]], axis=1)
-    basis = np.where(valid[:, None], basis, 0.0)
+    # Where the measured normal runs along the predicted stripe, a pixel across it says nothing.
+    valid &= np.abs(per_pixel) > 0.02 * depth * rows.ray_size_px
+    centre = np.einsum("kij,ki->kj", R_panel, t_panel)[lines.slot][of_row]
+    basis = np.empty((len(valid), 7))
+    basis[:, 0] = np.where(valid, inverse, 0.0)
+    depth = np.where(valid, depth, 0.0)
+    alpha = np.where(valid, alpha, 0.0)
+    basis[:, 1] = basis[:, 0] * (depth * ray_x - centre[:, 0])
+    basis[:, 2] = basis[:, 0] * (depth * ray_y - centre[:, 1])
+    basis[:, 3:6] = alpha[:, None] * basis[:, :3]
+    basis[:, 6] = basis[:, 0] * depth * (focal_m - alpha * focal_n)
     to = np.zeros((lines.count, 7, N_GLOBAL + 6))
     light = _moment_map(R_place[lines.place, :, 2], R_panel[lines.slot], t_panel[lines.slot])
     to[:, :3, : N_MOTION + 1] = -np.swapaxes(light, 1, 2) @ J_place[lines.place]
@@ -475,6 +506,25 @@ def stripe_residuals(data: JointData, state: JointState) -> LineResiduals:
     to[:, 3:6, N_GLOBAL:] = np.swapaxes(map_panel[lines.slot], 1, 2) @ J_panel[lines.slot]
     to[:, 6, _FOCAL] = 1.0
     return LineResiduals(np.where(valid, distance * inverse, 0.0), basis, to, valid)
+
+
+def _stripe_products(rows: StripeRows, R_panel: FloatArray, light_normal: FloatArray) -> FloatArray:
+    """Products (8, N) of each row's ray and its two derivatives with its line's vectors.
+
+    In this order: the ray, its derivative by a pixel and by the focal scale, each with the panel's normal and with the
+    light plane's (S, 3); the ray with the panel's two axes. One small matrix product a line.
+    """
+    joined = np.concatenate([rows.rays, rows.ray_per_px, rows.ray_per_focal], axis=1)
+    factors = np.zeros((rows.lines.count, 9, 8))
+    for k in range(3):
+        factors[:, 3 * k : 3 * k + 3, 2 * k] = R_panel[:, :, 2]
+        factors[:, 3 * k : 3 * k + 3, 2 * k + 1] = light_normal
+    factors[:, :3, 6:] = R_panel[:, :, :2]
+    out = np.empty((len(joined), 8))
+    start = rows.lines.start
+    for j in range(rows.lines.count):
+        np.matmul(joined[start[j] : start[j + 1]], factors[j], out=out[start[j] : start[j + 1]])
+    return np.ascontiguousarray(out.T)
 
 
 def range_residuals(data: JointData, state: JointState) -> LineResiduals:

@@ -1,0 +1,112 @@
+"""What whole lines are off by: the variance of their shifts and slopes beyond what the scatter of their rows explains.
+
+A stripe's centre pulled by the squares, a plate that is not flat, or a wrong model move all points of a line together.
+Hundreds of points then promise a precision that is not there. The part that a line's points share is therefore a random
+effect, a shift and a slope a line, whose variance is estimated from how far lines lie from the solution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarpose.geometry.arrays import BoolArray, FloatArray
+
+LINE_REJECT = 36.0
+"""A line whose shift and slope have this chi-square of two degrees of freedom (6 sigma) or more is left out."""
+_MOST_LEFT_OUT = 0.25
+_MEDIAN_CHI_SQUARE_2 = 1.3862943611
+_SIGNIFICANCE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class _Effects:
+    """Each line's own least-squares shift and slope: values (S, 2), their covariance (S, 2, 2) from the rows' scatter,
+    and the part of the covariance that the parameters have absorbed (S, 2, 2)."""
+
+    own: FloatArray
+    covariance: FloatArray
+    absorbed: FloatArray
+
+    def standardised(self, variance: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Inverse covariances (S, 2, 2), squared standardised effects (S,), degrees of freedom (S,) at a variance."""
+        inverse = np.linalg.inv(self.covariance + variance * np.eye(2))
+        square = np.einsum("si,sij,sj->s", self.own, inverse, self.own)
+        freedom = np.maximum(2.0 - np.einsum("sij,sji->s", inverse, self.absorbed), 0.0)
+        return inverse, square, freedom
+
+
+def place_variance(moments: FloatArray, spread: FloatArray) -> tuple[float, FloatArray]:
+    """The variance of lines' shifts and slopes, and a weight for each line (0: it contradicts all others).
+
+    Parameters
+    ----------
+    moments : (S, b + 3, b + 3)
+        Of `line_moments`.
+    spread : (S, b, b)
+        Covariance of the basis' coefficients, from the parameters' uncertainty.
+
+    Fisher scoring of the restricted likelihood, with what the parameters absorbed taken as shared out evenly between
+    shift and slope. Zero unless it is significant at the 5 % level.
+    """
+    effects, good = _effects(moments, spread)
+    if good.sum() < 3:
+        return 0.0, np.ones(len(moments))
+    variance = _robust_start(effects, good)
+    use = _agreeing(effects, good, variance)
+    for _ in range(30):
+        new = max(variance + _scoring_step(effects, use, variance), 0.0)
+        settled = abs(new - variance) <= 1e-4 * max(variance, 1e-300)
+        variance = new
+        use = _agreeing(effects, good, variance)
+        if settled or variance == 0.0:
+            break
+    if not _significant(effects, use):
+        variance = 0.0
+    return variance, np.where(good & ~use, 0.0, 1.0)
+
+
+def _effects(moments: FloatArray, spread: FloatArray) -> tuple[_Effects, BoolArray]:
+    size = moments.shape[1]
+    inner = moments[:, size - 3 : size - 1, size - 3 : size - 1]
+    good = np.linalg.det(inner) > 1e-12 * np.maximum(inner[:, 0, 0], 1e-300) ** 2
+    covariance = np.linalg.inv(np.where(good[:, None, None], inner, np.eye(2)))
+    coupling = covariance @ moments[:, size - 3 : size - 1, :]
+    to_parameters = coupling[:, :, : size - 3]
+    absorbed = to_parameters @ spread @ np.swapaxes(to_parameters, 1, 2)
+    return _Effects(coupling[:, :, -1], covariance, absorbed), good
+
+
+def _robust_start(effects: _Effects, good: BoolArray) -> float:
+    """From the median of the squared standardised effects, which pure noise puts at that of chi-square of 2."""
+    _, square, _ = effects.standardised(0.0)
+    ratio = float(np.median(square[good])) / _MEDIAN_CHI_SQUARE_2
+    size = float(np.median(np.trace(effects.covariance[good], axis1=1, axis2=2))) / 2.0
+    return max(ratio - 1.0, 0.0) * size
+
+
+def _agreeing(effects: _Effects, good: BoolArray, variance: float) -> BoolArray:
+    """Lines that do not contradict all others; more than a quarter cannot all be the odd ones out."""
+    _, square, _ = effects.standardised(variance)
+    out = good & (square > LINE_REJECT)
+    most = max(int(_MOST_LEFT_OUT * good.sum()), 1)
+    if out.sum() > most:
+        out = np.zeros_like(good)
+    return np.asarray(good & ~out)
+
+
+def _scoring_step(effects: _Effects, use: BoolArray, variance: float) -> float:
+    inverse, _, freedom = effects.standardised(variance)
+    standard = (inverse @ effects.own[:, :, None])[:, :, 0]
+    found = float((standard**2).sum(axis=1)[use].sum())
+    expected = float((np.trace(inverse, axis1=1, axis2=2) * freedom / 2.0)[use].sum())
+    fisher = float(np.einsum("sij,sji->s", inverse, inverse)[use].sum())
+    return (found - expected) / max(fisher, 1e-300)
+
+
+def _significant(effects: _Effects, use: BoolArray) -> bool:
+    from scipy.special import chdtri
+
+    _, square, freedom = effects.standardised(0.0)
+    return bool(square[use].sum() > chdtri(max(float(freedom[use].sum()), 1.0), _SIGNIFICANCE))

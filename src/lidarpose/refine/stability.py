@@ -1,0 +1,63 @@
+"""Does the answer depend on a few places? Parts of the arc are left out, one linear step each."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.refine.least_squares import add_lines, covariance_and_condition
+from lidarpose.refine.turntable_estimate import OutsideParameters
+from lidarpose.refine.turntable_joint import Moments, Solution, all_moments, lines_of, reduced_moments
+from lidarpose.refine.turntable_model import N_GLOBAL, N_MOTION, motion_map
+from lidarpose.refine.verdict import Stability, stability_ratio
+
+
+def leave_places_out(solution: Solution, outside: OutsideParameters, parts: int = 4) -> Stability | None:
+    """The part of the arc without which the pose at the arc's middle would change most unexpectedly.
+
+    The difference of an estimate and one from a part of its data has the difference of their covariances (Hausman,
+    1978). None where there are too few places to leave any out.
+    """
+    data = solution.data
+    order = np.argsort(data.angles_rad, kind="stable")
+    if len(order) < 5:
+        return None
+    moments = all_moments(data, solution.at, solution.noise)
+    reduced = {kind: reduced_moments(moments[kind], solution.noise.lines[kind]) for kind in moments}
+    to_motion = motion_map(solution.state, outside.motion, data.reference_rad)[:, :N_MOTION]
+    to_pose = outside.motion.pose_jacobian((1.0 + float(solution.state.extras[0])) * data.reference_rad) @ to_motion
+    worst: Stability | None = None
+    for block in np.array_split(order, min(parts, len(order))):
+        gone = np.isin(np.arange(len(order)), block)
+        change, expected = _without(solution, reduced, gone)
+        xi = to_pose @ change[:N_MOTION]
+        ratio = stability_ratio(xi, to_pose @ expected[:N_MOTION, :N_MOTION] @ to_pose.T)
+        if worst is None or ratio > worst.ratio:
+            centre = outside.motion.pose(data.reference_rad).translation
+            shift = xi[:3] + np.cross(xi[3:], centre)
+            angles = np.rad2deg(data.angles_rad[gone])
+            worst = Stability(
+                float(1e3 * np.linalg.norm(shift)),
+                float(np.rad2deg(np.linalg.norm(xi[3:]))),
+                ratio,
+                f"the places from {angles.min():.2f} to {angles.max():.2f} degrees",
+            )
+    return worst
+
+
+def _without(solution: Solution, reduced: Moments, gone: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Change of the active parameters without some places, and the covariance that it should have."""
+    n = N_GLOBAL + 6 * len(solution.data.slots)
+    information, gradient = np.zeros((n, n)), np.zeros(n)
+    for kind, residuals in solution.at.lines.items():
+        lines = lines_of(solution.data, kind)
+        mine = gone[lines.place]
+        add_lines(
+            reduced[kind][mine], residuals.to_parameters[mine], lines.slot[mine], N_GLOBAL, (information, gradient)
+        )
+    use = np.asarray(solution.active)
+    left = solution.equations.information[np.ix_(use, use)] - information[np.ix_(use, use)]
+    covariance, _, _ = covariance_and_condition(left)
+    change = covariance @ (solution.equations.gradient[use] - gradient[use])
+    change = change - solution.covariance @ solution.equations.gradient[use]
+    return change, covariance - solution.covariance

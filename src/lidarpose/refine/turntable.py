@@ -1,0 +1,168 @@
+"""The joint estimate of a turntable session, from observations and a start to an answer with a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.se3 import Pose
+from lidarpose.model.observation import TurntableObservations
+from lidarpose.model.turntable import TurntableMotion
+from lidarpose.model.turntable_result import ExtraParameter, TurntableEstimate
+from lidarpose.refine.observability import pose_spread, weak_directions, whole_turn
+from lidarpose.refine.stability import leave_places_out
+from lidarpose.refine.turntable_estimate import (
+    OutsideParameters,
+    extra_effect,
+    left_out_lines,
+    noise_estimates,
+    outside_parameters,
+    panel_poses,
+    require_determined,
+    residual_groups,
+    tested_extras,
+)
+from lidarpose.refine.turntable_joint import JointOptions, Solution, solve_joint
+from lidarpose.refine.turntable_model import EXTRAS, lay_out, start_state
+from lidarpose.refine.verdict import Evidence, judge, suggested
+
+__all__ = ["JointOptions", "refine_turntable"]
+
+
+def refine_turntable(
+    observations: TurntableObservations,
+    start_motion: TurntableMotion,
+    start_panel_poses: Mapping[str, tuple[Pose | None, ...]],
+    options: JointOptions | None = None,
+) -> TurntableEstimate:
+    """One robust maximum-likelihood estimate over all places, with its covariance, diagnosis and verdict.
+
+    Parameters
+    ----------
+    observations
+        Corners, stripes and scan lines, each with its panel. Stripes may be missing altogether.
+    start_motion, start_panel_poses
+        A rough solution in the fixed frames (from the closed form); T_camera_panel by placement.
+    options
+        See `JointOptions`.
+
+    Raises
+    ------
+    UndeterminedError
+        If the data leave a motion open; the message names it and what to record.
+    ValueError
+        If a panel in use has no start pose.
+    """
+    options = options or JointOptions()
+    data = lay_out(observations, use_stripes=options.use_stripes)
+    start = start_state(data, start_motion, start_panel_poses)
+    plain = replace(options, estimate=())
+    solution = solve_joint(data, start, plain)
+    outside = outside_parameters(solution)
+    require_determined(solution, outside)
+    refused: dict[str, str] = {}
+    if options.estimate:
+        chosen, refused = _observable(solution, options)
+        if chosen:
+            solution = solve_joint(data, solution.state, replace(options, estimate=chosen))
+            outside = outside_parameters(solution)
+            require_determined(solution, outside)
+        options = replace(options, estimate=chosen)
+    return _assemble(observations, solution, outside, options, refused)
+
+
+_LARGEST_SIGMA: dict[str, float] = {
+    "encoder_scale": 0.02,
+    "range_offset_m": 0.02,
+    "range_scale": 0.02,
+    "beam_angle_scale": 0.02,
+    "black_bias_m": 0.02,
+    "focal_scale": 0.05,
+}
+"""An extra parameter that the data determine no better than this is not turned on."""
+
+
+def _observable(solution: Solution, options: JointOptions) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Which of the chosen extra parameters the data can tell, and why the others are refused."""
+    tested = {e.name: e for e in tested_extras(solution, replace(options, estimate=()))}
+    chosen, refused = [], {}
+    for name in options.estimate:
+        if not tested[name].observable:
+            refused[name] = "not estimated: the data cannot tell it"
+        elif tested[name].sigma > _LARGEST_SIGMA[name]:
+            refused[name] = f"not estimated: its standard deviation would be {tested[name].sigma:.2g}"
+        else:
+            chosen.append(name)
+    return tuple(chosen), refused
+
+
+def _assemble(
+    observations: TurntableObservations,
+    solution: Solution,
+    outside: OutsideParameters,
+    options: JointOptions,
+    refused: Mapping[str, str],
+) -> TurntableEstimate:
+    data, C = solution.data, outside.covariance[:10, :10]
+    angles = data.angles_rad
+    inside_at = np.unique([angles.min(), data.reference_rad, angles.max()])
+    inside = pose_spread(outside.motion, C, inside_at)
+    extras = _judged_extras(solution, outside, options, refused, inside_at)
+    noise = noise_estimates(solution)
+    directions = weak_directions(outside.motion, C, angles)
+    evidence = Evidence(
+        noise=noise,
+        range_sigma_m=observations.lidar.range_sigma_m,
+        inside=inside,
+        around=pose_spread(outside.motion, C, whole_turn(data.reference_rad)),
+        want_mm=options.want_mm,
+        want_deg=options.want_deg,
+        converged=solution.converged,
+        lines_offered={k: len(n.line_weights) for k, n in solution.noise.lines.items()},
+        lines_left_out={k: int((n.line_weights == 0.0).sum()) for k, n in solution.noise.lines.items()},
+        extras=extras,
+        stability=leave_places_out(solution, outside),
+        directions=directions,
+        places=len(observations.places),
+    )
+    return TurntableEstimate(
+        motion=outside.motion,
+        panel_poses=panel_poses(solution, observations),
+        parameter_names=outside.names,
+        parameter_covariance=outside.covariance,
+        noise=noise,
+        residuals=residual_groups(solution),
+        left_out=left_out_lines(solution, observations),
+        cost=0.5 * solution.equations.sum_of_squares,
+        converged=solution.converged,
+        iterations=solution.iterations,
+        condition_number=solution.condition_number,
+        directions=directions,
+        extras=extras,
+        quality=judge(evidence),
+        findings=tuple(evidence.findings),
+        reading_scale=float(1.0 + solution.state.extras[0]),
+        extra_values={n: float(solution.state.extras[EXTRAS.index(n)]) for n in options.estimate},
+    )
+
+
+def _judged_extras(
+    solution: Solution,
+    outside: OutsideParameters,
+    options: JointOptions,
+    refused: Mapping[str, str],
+    inside_at: FloatArray,
+) -> tuple[ExtraParameter, ...]:
+    inside = pose_spread(outside.motion, outside.covariance[:10, :10], inside_at)
+    out = []
+    for extra in tested_extras(solution, options):
+        if extra.name in refused:
+            extra = replace(extra, note=refused[extra.name])
+        effect = (0.0, 0.0)
+        if extra.observable and not extra.estimated:
+            effect = extra_effect(solution, outside, extra.name, extra.value)
+        out.append(replace(extra, suggested=suggested(extra, effect, inside)))
+    return tuple(out)
