@@ -43,3 +43,13 @@ def test_an_image_without_boards_names_the_missing_panel() -> None:
     with pytest.raises(BoardNotFoundError, match="7 x 5 inner corners") as caught:
         find_panels([noise], [Panel(7, 5, 0.02), Panel(7, 5, 0.02)])
     assert caught.value.panel == 0
+
+
+def test_a_board_of_another_size_is_named_not_taken(two_panels) -> None:
+    image = two_panels.noisy(two_panels.bright(), np.random.default_rng(3))
+    panel = two_panels.boards[0].panel
+    for columns, rows in ((7, 5), (panel.columns - 1, panel.rows), (panel.columns, panel.rows + 1)):
+        with pytest.raises(BoardNotFoundError, match="12 x 9") as caught:
+            find_panels([image], [panel, Panel(columns, rows, 0.02)])
+        assert caught.value.panel == 1
+        assert f"expected {columns} x {rows}" in str(caught.value)

@@ -1,9 +1,9 @@
 """Chessboards in bright images: every inner corner of every panel, averaged over the shots.
 
-Boards are searched one after the other, each found one hidden before the next search, with the quickest detector that
-finds them. Corners are refined in every full-size shot, by the gradients around them, and averaged. A smooth map from
-the grid to the image (`GridMap`) is fitted to the averages: its residuals give the standard deviation that is stated,
-whatever the image's noise, blur and contrast, and the board's outline.
+Boards are searched first as grids of whatever size, then by detectors that know the size. Corners are refined in every
+full-size shot, by the gradients around them, and averaged. A smooth map from the grid to the image (`GridMap`) is
+fitted to the averages: its residuals give the standard deviation that is stated, whatever the image's noise, blur and
+contrast, and the board's outline.
 
 Order of equal panels: the file cannot tell two panels of the same size apart. They are taken from left to right, or
 from top to bottom where their centres are further apart vertically than horizontally.
@@ -12,13 +12,14 @@ from top to bottom where their centres are further apart vertically than horizon
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
 from lidarpose.detect.grid_map import GridFit, GridMap, fit_grid_map, grid_points
-from lidarpose.detect.grid_search import Image8, find_grid
+from lidarpose.detect.grid_search import GridSearch, find_grids
+from lidarpose.detect.lattice import Image8
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.model.image import GrayImage
@@ -108,37 +109,36 @@ def find_panels(images: Sequence[GrayImage], panels: Sequence[Panel]) -> BoardDe
 
 
 def _first_shot_with_all(images: Sequence[GrayImage], panels: Sequence[Panel]) -> tuple[int, list[FloatArray]]:
-    missing: int | None = None
+    failure: BoardNotFoundError | None = None
     # More than three unsuccessful shots of one scene will not be cured by a fourth.
     for index, image in enumerate(images[:3]):
-        located = _locate(_to_8_bit(image), panels)
-        absent = [k for k, corners in enumerate(located) if corners is None]
-        if not absent:
-            return index, [corners for corners in located if corners is not None]
-        missing = absent[0] if missing is None else missing
-    assert missing is not None
-    panel = panels[missing]
-    raise BoardNotFoundError(
-        f"Panel {missing} ({panel.columns} x {panel.rows} inner corners) was not found in the bright images",
+        search = _locate(image, panels)
+        if all(corners is not None for corners in search.grids):
+            return index, [corners for corners in search.grids if corners is not None]
+        failure = failure or _not_found(search, panels)
+    assert failure is not None
+    raise failure
+
+
+def _not_found(search: GridSearch, panels: Sequence[Panel]) -> BoardNotFoundError:
+    missing = [k for k, corners in enumerate(search.grids) if corners is None]
+    panel = panels[missing[0]]
+    seen = [f"{panels[k].columns} x {panels[k].rows}" for k in range(len(panels)) if k not in missing]
+    seen += [f"{columns} x {rows}" for columns, rows in search.other_sizes[:3]]
+    found = f"found: {', '.join(seen)}" if seen else "no chessboard was found at all"
+    return BoardNotFoundError(
+        f"Panel {missing[0]} was not found in the bright images: "
+        f"expected {panel.columns} x {panel.rows} inner corners; {found}",
         remedy="Check columns and rows (inner corners, not squares), and that the whole panel is in view, sharp, "
         "evenly lit and not over-exposed.",
-        panel=missing,
+        panel=missing[0],
     )
 
 
-def _locate(image: Image8, panels: Sequence[Panel]) -> list[FloatArray | None]:
-    """Corners of each panel to about a pixel, or None."""
-    canvas = image.copy()
-    located: list[FloatArray | None] = [None] * len(panels)
-    # The panel with more squares first: a small grid might be found within a large one, not the other way round.
-    for k in sorted(range(len(panels)), key=lambda k: -panels[k].columns * panels[k].rows):
-        columns, rows = panels[k].columns, panels[k].rows
-        corners = find_grid(canvas, columns, rows)
-        if corners is None:
-            continue
-        located[k] = corners
-        _hide(canvas, fit_grid_map(columns, rows, grid_points(columns, rows), corners).map)
-    return _in_stated_order(located, panels)
+def _locate(image: GrayImage, panels: Sequence[Panel]) -> GridSearch:
+    """Corners of each panel to about a pixel, equal panels in the stated order."""
+    search = find_grids(_to_8_bit(image), [(panel.columns, panel.rows) for panel in panels])
+    return replace(search, grids=tuple(_in_stated_order(list(search.grids), panels)))
 
 
 def _in_stated_order(located: list[FloatArray | None], panels: Sequence[Panel]) -> list[FloatArray | None]:
@@ -156,14 +156,6 @@ def _in_stated_order(located: list[FloatArray | None], panels: Sequence[Panel]) 
     return ordered
 
 
-def _hide(canvas: Image8, grid_map: GridMap) -> None:
-    """Paint a found board over in its mean grey, up to nearly the outer squares' edge (another may begin there)."""
-    polygon = np.round(grid_map.outline(margin=0.8)).astype(np.int32)
-    x, y, width, height = cv2.boundingRect(polygon)
-    view = canvas[max(y, 0) : y + height, max(x, 0) : x + width]
-    cv2.fillPoly(canvas, [polygon], float(view.mean()))
-
-
 def _refine_or_find_again(
     image: GrayImage, panels: Sequence[Panel], start: list[FloatArray], is_reference: bool
 ) -> list[FloatArray]:
@@ -172,7 +164,7 @@ def _refine_or_find_again(
     plausible = [_agrees(a, b) for a, b in zip(refined, start, strict=True)]
     if is_reference or all(plausible):
         return refined
-    located = _locate(_to_8_bit(image), panels)
+    located = _locate(image, panels).grids
     return [
         np.full(first.shape, np.nan) if corners is None else refine_corners(image, corners, panel)
         for corners, panel, first in zip(located, panels, start, strict=True)
