@@ -22,6 +22,12 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "pose": ("lidarpose.cli.pose:pose", "The LiDAR's pose at a turntable angle, with its standard deviations."),
 }
 _GROUPS: dict[str, tuple[str, dict[str, tuple[str, str]]]] = {
+    "measure": (
+        "Sizes from a sweep recording or a cloud.",
+        {
+            "disk": ("lidarpose.cli.measure_disk:measure_disk", "A disk's diameter, or round holes in a plane."),
+        },
+    ),
     "simulate": (
         "Make up a session or recording with its truth beside it.",
         {
@@ -29,6 +35,7 @@ _GROUPS: dict[str, tuple[str, dict[str, tuple[str, str]]]] = {
                 "lidarpose.cli.simulate_corners:simulate_corners",
                 "A target of three faces moved from place to place before a 3D LiDAR.",
             ),
+            "disk": ("lidarpose.cli.simulate_disk:simulate_disk", "A sweep recording of a disk before a background."),
         },
     ),
 }

@@ -8,6 +8,7 @@ import numpy as np
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
+from lidarpose.geometry.se3 import Pose, exp_so3, rotation_z
 from lidarpose.measure.assemble import beam_origins_and_directions
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.turntable import TurntableMotion
@@ -51,6 +52,28 @@ def beams_of(recording: SweepRecording, motion: TurntableMotion) -> Beams:
         origin = np.broadcast_to(origin[:, None], direction.shape)
     r = np.asarray(recording.range_m, dtype=np.float64)
     return Beams(origin, direction, np.where(recording.has_return(), r, np.nan))
+
+
+def chosen_beams(
+    recording: SweepRecording, motion: TurntableMotion, index: IntArray, change: FloatArray | None = None
+) -> Beams:
+    """Beams (n,) of flat indices in the camera frame, after a small change (10,) of the motion's parameters.
+
+    The change is in the order of `lidarpose.model.turntable.PARAMETER_NAMES`.
+    """
+    change = np.zeros(10) if change is None else change
+    i, j = np.divmod(index, recording.beams)
+    readings = recording.turntable_angle_deg
+    angle = np.deg2rad(np.asarray(readings[i, j] if recording.has_reading_per_beam else readings[i], dtype=np.float64))
+    theta = recording.beam_angle_rad[j]
+    R_tl = exp_so3(change[7:10]) @ motion.T_turntable_lidar.rotation
+    T_ct = Pose.exp(change[:6]) @ motion.T_camera_turntable
+    turn = rotation_z(angle)
+    d = np.stack([np.cos(theta), np.sin(theta), np.zeros_like(theta)], -1) @ R_tl.T
+    direction = T_ct.rotate((turn @ d[..., None])[..., 0])
+    origin = T_ct @ (turn[..., 0] * (motion.radius_m + change[6]))
+    r = np.asarray(recording.range_m.reshape(-1)[index], dtype=np.float64)
+    return Beams(origin, direction, np.where((r > 0.0) & (r < np.inf), r, np.nan))
 
 
 def range_noise(range_m: FloatArray) -> float:

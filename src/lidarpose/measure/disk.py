@@ -157,16 +157,14 @@ class _View:
     plane: Plane
     plane_covariance: FloatArray
     plane_rms: float
-    plane_used: BoolArray
+    plane_used: IntArray
     frame: FloatArray
     place: FloatArray
     excess: FloatArray
     step: float
 
 
-def _measure(
-    beams: Beams, patch: Patch, outline: RoundOutline, sigma: float, seed: int
-) -> RoundMeasurement | None:
+def _measure(beams: Beams, patch: Patch, outline: RoundOutline, sigma: float, seed: int) -> RoundMeasurement | None:
     circle = outline.circle
     for _ in range(3):
         view, place_circle = _view(beams, patch, circle, outline.kind, sigma)
@@ -231,9 +229,7 @@ def _view(beams: Beams, patch: Patch, circle: Circle2, kind: Kind, sigma: float)
     return view, Circle2(in_plane(centre, plane, new_frame), circle.radius)
 
 
-def _edge_beams(
-    view: _View, circle: Circle2, kind: Kind, sigma: float
-) -> tuple[IntArray, EdgeBeams, float] | None:
+def _edge_beams(view: _View, circle: Circle2, kind: Kind, sigma: float) -> tuple[IntArray, EdgeBeams, float] | None:
     """The beams that cross the edge where it is free, with the background each would see; None if too few."""
     noise = max(sigma, view.plane_rms)
     s = circle.distance(view.place) * (1.0 if kind == "disk" else -1.0)
@@ -307,9 +303,7 @@ def _backgrounds(
     return usable, open_, depth, sigma
 
 
-def _result(
-    view: _View, outline: RoundOutline, near: IntArray, edge: EdgeBeams, fit: EdgeFit
-) -> RoundMeasurement:
+def _result(view: _View, outline: RoundOutline, near: IntArray, edge: EdgeBeams, fit: EdgeFit) -> RoundMeasurement:
     normal = view.plane.normal
     if float(np.mean(view.beams.direction[near] @ normal)) > 0.0:
         normal = -normal
@@ -397,5 +391,5 @@ def with_calibration(
             plane = fit_plane_to_ranges(support.plane, perturbed_beams(sign * step, plane_index), np.inf)[0]
             radii.append(circle_on_plane(perturbed_beams(sign * step, support.edge_index), plane, support))
         gradient[k] = (radii[0] - radii[1]) / 2e-5
-    share = 2.0 * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
+    share = 2.0 * float(np.sqrt(max(float(gradient @ covariance @ gradient), 0.0)))
     return replace(measurement, calibration_sigma_m=share)

@@ -27,8 +27,8 @@ from scipy.special import ndtr
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 
 # Spot widths (standard deviations) that the prior allows, metres.
-SMALLEST_SPOT_M, LARGEST_SPOT_M = 2e-5, 1e-2
-_SMALLEST_SCATTER, _LARGEST_SCATTER = 1e-5, 1.0
+SMALLEST_SPOT_M, LARGEST_SPOT_M = 4e-5, 1e-2
+_SMALLEST_SCATTER, _LARGEST_SCATTER = 1e-5, 2.0
 _OUTLIERS = 0.01
 
 
@@ -59,6 +59,10 @@ class EdgeBeams:
     def __len__(self) -> int:
         return len(self.place)
 
+    def at(self, mask: BoolArray) -> EdgeBeams:
+        """Some of the beams."""
+        return EdgeBeams(self.place[mask], self.slope[mask], self.depth[mask], self.depth_sigma[mask], self.open[mask])
+
 
 @dataclass(frozen=True, eq=False)
 class EdgeFit:
@@ -88,7 +92,7 @@ class EdgeFit:
 
 
 def signed_distance(beams: EdgeBeams, centre: FloatArray, radius: FloatArray | float) -> tuple[FloatArray, FloatArray]:
-    """Distances (..., n) outside the circle, and how much longer (..., n) the spot is across the edge than the beam is wide.
+    """Distances (..., n) outside the circle, and by what factor (..., n) the spot is drawn out across the edge.
 
     `centre` is (..., 2), `radius` (...).
     """
@@ -100,41 +104,59 @@ def signed_distance(beams: EdgeBeams, centre: FloatArray, radius: FloatArray | f
     return length - np.asarray(radius)[..., None], stretch
 
 
-def log_likelihood(parameters: FloatArray, beams: EdgeBeams, *, inside: bool, dropout: float) -> FloatArray:
-    """Log-likelihood (k,) of parameters (k, 6): centre x, y, radius, log spot width, log scatter, share of mixed lost.
+@dataclass(frozen=True, eq=False)
+class _Sorted:
+    """Edge beams in the order: bounded with and without return, open with and without return; counts of each."""
 
-    Parameters
-    ----------
-    inside
-        True if the material is inside the circle (a disk), False if outside (a hole).
-    dropout
-        Share of beams that return nothing anywhere.
-    """
-    radius = parameters[:, 2]
-    spot, scatter, lost = np.exp(parameters[:, 3, None]), np.exp(parameters[:, 4, None]), parameters[:, 5, None]
-    s, stretch = signed_distance(beams, parameters[:, :2], radius)
-    # Of a spot centred on the edge of a disk less than half is on it, by the sagitta of the arc.
-    width = spot * stretch
-    u = (s + 0.5 * spot**2 / radius[:, None]) / width
-    F = ndtr(-u if inside else u)
+    place: FloatArray
+    stretch: FloatArray
+    depth: FloatArray
+    near_variance: FloatArray
+    far_variance: FloatArray
+    ends: tuple[int, int, int]
+
+
+def _sorted(beams: EdgeBeams, centre: FloatArray) -> _Sorted:
     has_return = np.isfinite(beams.depth)
-    bounded = ~beams.open
-    total = np.zeros(len(parameters))
-    some = bounded & has_return
-    total += _log_depth(beams.depth[some], beams.depth_sigma[some], F[:, some], scatter).sum(axis=1)
-    drop = np.clip(dropout + (1.0 - dropout) * lost * 4.0 * F * (1.0 - F), 1e-9, 1.0 - 1e-9)
-    total += np.log1p(-drop[:, some]).sum(axis=1) + np.log(drop[:, bounded & ~has_return]).sum(axis=1)
-    seen = (1.0 - dropout) * F * (1.0 - 2.0 * _OUTLIERS) + _OUTLIERS
-    total += np.log(seen[:, beams.open & has_return]).sum(axis=1)
-    total += np.log1p(-seen[:, beams.open & ~has_return]).sum(axis=1)
+    group = 2 * beams.open.astype(int) + (~has_return).astype(int)
+    order = np.argsort(group, kind="stable")
+    bounds = np.cumsum(np.bincount(group, minlength=4))
+    # How the spot is drawn out changes so little with the centre that the first estimate is enough.
+    _, stretch = signed_distance(beams, centre, 1.0)
+    kept = order[: bounds[0]]
+    return _Sorted(
+        beams.place[order],
+        stretch[order],
+        beams.depth[kept],
+        beams.depth_sigma[kept, 0] ** 2,
+        beams.depth_sigma[kept, 1] ** 2,
+        (int(bounds[0]), int(bounds[1]), int(bounds[2])),
+    )
+
+
+def _log_likelihood(x: FloatArray, data: _Sorted, inside: bool, dropout: float) -> FloatArray:
+    """Log-likelihood (k,) of parameters (k, 6): centre x, y, radius, log spot, log scatter, share lost."""
+    radius, spot = x[:, 2, None], np.exp(x[:, 3, None])
+    scatter, lost = np.exp(x[:, 4, None]), x[:, 5, None]
+    s = np.hypot(data.place[:, 0] - x[:, 0, None], data.place[:, 1] - x[:, 1, None]) - radius
+    # Of a spot centred on the edge of a disk less than half is on it, by the sagitta of the arc.
+    u = (s + 0.5 * spot**2 / radius) / (spot * data.stretch)
+    F = ndtr(-u if inside else u)
+    a, b, c = data.ends
+    share = F[:, :a]
+    mixed = share * (1.0 - share)
+    variance = share * data.near_variance + (1.0 - share) * data.far_variance + scatter * mixed
+    normal = np.exp(-0.5 * (data.depth - 1.0 + share) ** 2 / variance) / np.sqrt(2.0 * np.pi * variance)
+    kept = 1.0 - np.minimum(dropout + (1.0 - dropout) * lost * 4.0 * mixed, 1.0 - 1e-9)
+    # An outlier may lie anywhere between material and background, and a little beyond.
+    total = np.log(kept * ((1.0 - _OUTLIERS) * normal + _OUTLIERS / 1.5)).sum(axis=1)
+    if b > a:
+        none = F[:, a:b]
+        total += np.log(dropout + (1.0 - dropout) * lost * 4.0 * none * (1.0 - none) + 1e-9).sum(axis=1)
+    if len(data.place) > b:
+        seen = (1.0 - dropout) * F[:, b:] * (1.0 - 2.0 * _OUTLIERS) + _OUTLIERS
+        total += np.log(seen[:, : c - b]).sum(axis=1) + np.log1p(-seen[:, c - b :]).sum(axis=1)
     return np.asarray(total)
-
-
-def _log_depth(depth: FloatArray, sigma: FloatArray, F: FloatArray, scatter: FloatArray) -> FloatArray:
-    variance = F * sigma[:, 0] ** 2 + (1.0 - F) * sigma[:, 1] ** 2 + scatter * F * (1.0 - F)
-    normal = np.exp(-0.5 * (depth - (1.0 - F)) ** 2 / variance) / np.sqrt(2.0 * np.pi * variance)
-    # An outlier may lie anywhere between and a little beyond.
-    return np.asarray(np.log((1.0 - _OUTLIERS) * normal + _OUTLIERS / 1.5))
 
 
 def fit_edge(
@@ -157,71 +179,92 @@ def fit_edge(
         How far the first estimate may be off, metres; also about the distance between beams.
     """
 
-    def log_posterior(x: FloatArray) -> FloatArray:
-        low = np.log([SMALLEST_SPOT_M, _SMALLEST_SCATTER])
-        high = np.log([LARGEST_SPOT_M, _LARGEST_SCATTER])
-        ok = ((x[:, 3:5] > low) & (x[:, 3:5] < high)).all(axis=1) & (x[:, 5] >= 0.0) & (x[:, 5] <= 1.0)
-        ok &= np.abs(x[:, 2] - radius) < 0.5 * radius
-        value = np.full(len(x), -np.inf)
-        if ok.any():
-            value[ok] = log_likelihood(x[ok], beams, inside=inside, dropout=dropout)
-        return value
-
+    log_posterior = _posterior(beams, centre, radius, inside, dropout)
     rng = np.random.default_rng(seed)
-    start = _search(log_posterior, centre, radius, reach, rng)
-    samples = _sample(log_posterior, start, rng)
+    walkers = _anneal(log_posterior, _start(centre, radius, reach, rng), rng)
+    # Beams far from the edge, in widths of the spot, say nothing more.
+    spot = float(np.exp(walkers[:, 3].max()))
+    s, stretch = signed_distance(beams, walkers[:, :2].mean(axis=0), float(walkers[:, 2].mean()))
+    log_posterior = _posterior(
+        beams.at(np.abs(s) < 6.0 * spot * stretch + 1.5 * reach), centre, radius, inside, dropout
+    )
+    samples = _sample(log_posterior, walkers, rng)
     mean = samples[:, :3].mean(axis=0)
     covariance = np.cov(samples[:, :3].T)
     spot, scatter = np.exp(np.median(samples[:, 3:5], axis=0))
     return EdgeFit(mean[:2], float(mean[2]), covariance, float(spot), float(scatter), float(np.median(samples[:, 5])))
 
 
-_WALKERS = 24
-_STEPS = 420
-_BURN = 180
+LogDensity = Callable[[FloatArray], FloatArray]
 
 
-def _search(
-    log_posterior: Callable[[FloatArray], FloatArray],
-    centre: FloatArray,
-    radius: float,
-    reach: float,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """Walkers (k, 6) where the posterior is high: the best of many random starts, drawn closer round by round."""
-    middle = np.array([centre[0], centre[1], radius, np.log(0.4 * reach), np.log(0.03), 0.2])
-    spread = np.array([0.5 * reach, 0.5 * reach, 0.5 * reach, 0.8, 2.0, 0.3])
-    best = np.zeros((0, 6))
-    value = np.zeros(0)
-    for _ in range(12):
-        trial = middle + spread * rng.normal(size=(160, 6))
-        trial[:, 5] = np.clip(trial[:, 5], 0.0, 1.0)
-        best, value = np.vstack([best, trial]), np.concatenate([value, log_posterior(trial)])
-        order = np.argsort(-value, kind="stable")[:_WALKERS]
-        best, value = best[order], value[order]
-        middle = best.mean(axis=0)
-        spread = np.maximum(1.2 * best.std(axis=0), np.array([1e-6, 1e-6, 1e-6, 0.05, 0.1, 0.02]))
-    return best
+def _posterior(beams: EdgeBeams, centre: FloatArray, radius: float, inside: bool, dropout: float) -> LogDensity:
+    """Log posterior density (k,) of parameters (k, 6), up to a constant; the prior is even within bounds."""
+    data = _sorted(beams, centre)
+    low = np.log([SMALLEST_SPOT_M, _SMALLEST_SCATTER])
+    high = np.log([LARGEST_SPOT_M, _LARGEST_SCATTER])
+
+    def density(x: FloatArray) -> FloatArray:
+        ok = ((x[:, 3:5] > low) & (x[:, 3:5] < high)).all(axis=1) & (x[:, 5] >= 0.0) & (x[:, 5] <= 1.0)
+        ok &= np.abs(x[:, 2] - radius) < 0.5 * radius
+        value = np.full(len(x), -np.inf)
+        if ok.any():
+            value[ok] = _log_likelihood(x[ok], data, inside, dropout)
+        return value
+
+    return density
 
 
-def _sample(
-    log_posterior: Callable[[FloatArray], FloatArray], walkers: FloatArray, rng: np.random.Generator
-) -> FloatArray:
-    """Samples of the posterior by the stretch move of Goodman and Weare (2010), which knows no scales to tune."""
-    k, d = walkers.shape
-    x = walkers + 1e-7 * rng.normal(size=walkers.shape)
-    value = log_posterior(x)
+_WALKERS = 32
+_TEMPERATURES = np.geomspace(60.0, 1.0, 90)
+_SETTLE = 40
+_STEPS = 200
+
+
+def _start(centre: FloatArray, radius: float, reach: float, rng: np.random.Generator) -> FloatArray:
+    """Walkers (k, 6) spread over what the first estimate leaves open."""
+    middle = np.array([centre[0], centre[1], radius, np.log(0.4 * reach), np.log(0.03), 0.3])
+    walkers = middle + np.array([0.3 * reach, 0.3 * reach, 0.3 * reach, 0.5, 1.5, 0.15]) * rng.normal(
+        size=(_WALKERS, 6)
+    )
+    walkers[:, 5] = np.clip(walkers[:, 5], 0.01, 0.99)
+    walkers[:, 3] = np.clip(walkers[:, 3], np.log(1.2 * SMALLEST_SPOT_M), np.log(0.8 * LARGEST_SPOT_M))
+    walkers[:, 4] = np.clip(walkers[:, 4], np.log(2.0 * _SMALLEST_SCATTER), np.log(0.8 * _LARGEST_SCATTER))
+    return walkers
+
+
+def _anneal(log_density: LogDensity, walkers: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Walkers cooled down from a flattened posterior, so that none stays behind in a side valley."""
+    value = log_density(walkers)
+    for temperature in _TEMPERATURES:
+        walkers, value = _stretch(log_density, walkers, value, float(temperature), rng)
+    return walkers
+
+
+def _sample(log_density: LogDensity, walkers: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Samples (n, 6) of the posterior."""
+    value = log_density(walkers)
     kept = []
-    for step in range(_STEPS):
-        for half in (np.arange(k) < k // 2, np.arange(k) >= k // 2):
-            others = x[~half][rng.integers(0, k // 2, k // 2)]
-            z = (1.0 + rng.uniform(size=k // 2)) ** 2 / 2.0
-            trial = others + z[:, None] * (x[half] - others)
-            trial_value = log_posterior(trial)
-            with np.errstate(invalid="ignore"):
-                accept = np.log(rng.uniform(size=k // 2)) < (d - 1) * np.log(z) + trial_value - value[half]
-            index = np.flatnonzero(half)[accept]
-            x[index], value[index] = trial[accept], trial_value[accept]
-        if step >= _BURN:
-            kept.append(x.copy())
+    for step in range(_SETTLE + _STEPS):
+        walkers, value = _stretch(log_density, walkers, value, 1.0, rng)
+        if step >= _SETTLE:
+            kept.append(walkers.copy())
     return np.concatenate(kept)
+
+
+def _stretch(
+    log_density: LogDensity, walkers: FloatArray, value: FloatArray, temperature: float, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """One stretch move of all walkers (Goodman and Weare, 2010), which knows no scales to tune."""
+    k, d = walkers.shape
+    walkers, value = walkers.copy(), value.copy()
+    halves = np.array_split(rng.permutation(k), 2)
+    for mine, others in (halves, halves[::-1]):
+        partner = walkers[others[rng.integers(0, len(others), len(mine))]]
+        z = (1.0 + rng.uniform(size=len(mine))) ** 2 / 2.0
+        trial = partner + z[:, None] * (walkers[mine] - partner)
+        trial_value = log_density(trial)
+        gain = np.where(np.isneginf(trial_value), -np.inf, trial_value - value[mine])
+        accept = np.log(rng.uniform(size=len(mine))) < (d - 1) * np.log(z) + gain / temperature
+        walkers[mine[accept]], value[mine[accept]] = trial[accept], trial_value[accept]
+    return walkers, value

@@ -1,4 +1,4 @@
-"""Recordings of a disk in a room, as in the turntable paper's section 3.2: a fan of beams turned about an upright axis."""
+"""Recordings of a disk in a room, as in the turntable paper's section 3.2: a fan of beams turned about an axis."""
 
 from __future__ import annotations
 
@@ -89,7 +89,9 @@ def disk_surfaces(scene: DiskScene, motion: TurntableMotion) -> list[Surface]:
     room = Pose(nearest_rotation(np.column_stack([np.cross(down, forward), down, forward])), T_camera_disk.translation)
     surfaces: list[Surface] = [Disk(T_camera_disk, 0.5 * scene.diameter_m, 0.9)]
     if scene.background != "none":
-        behind = 0.6 if scene.background == "wall" else 0.06 + 0.5 * scene.diameter_m * np.sin(np.deg2rad(scene.tilt_deg))
+        behind = (
+            0.6 if scene.background == "wall" else 0.06 + 0.5 * scene.diameter_m * np.sin(np.deg2rad(scene.tilt_deg))
+        )
         turned = exp_so3([0.0, np.deg2rad(8.0), 0.0]) if scene.background == "wall" else np.eye(3)
         surfaces.append(Sheet(room @ Pose(turned, np.array([0.0, 0.0, behind])), reflectivity=0.9))
     if scene.stand:

@@ -87,7 +87,7 @@ def assemble_scan(
             remedy='Calibrate the world with cloud_frame = "camera" in its session.',
         )
     if options.never_stops and not recording.has_reading_per_beam:
-        _check_times(recording)
+        require_times(recording)
     motion = _fold_in(calibration.motion, world)
     for first, part in recording.parts(points_per_part):
         if options.never_stops and not recording.has_reading_per_beam:
@@ -95,7 +95,8 @@ def assemble_scan(
         yield _cloud(part, first, calibration, options, world, motion)
 
 
-def _check_times(recording: SweepRecording) -> None:
+def require_times(recording: SweepRecording) -> None:
+    """Raise InputError if readings cannot be interpolated by time."""
     if recording.time_s is None or recording.sweeps < 2:
         raise InputError(
             recording.name,

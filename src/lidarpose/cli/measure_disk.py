@@ -1,0 +1,110 @@
+"""`lidarpose measure disk`: disks and round holes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from lidarpose.cli.options import Json
+
+if TYPE_CHECKING:
+    from lidarpose.measure.disk import RoundMeasurement
+
+
+def measure_disk(
+    source: Path,
+    calibration: Path | None = None,
+    /,
+    *,
+    hole: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    never_stops: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    json: Json = False,
+) -> None:
+    """Measure a disk, or round holes in a plane: diameter without bias, and how sure it is.
+
+    The disk is found unaided. Its edge is estimated from which beams hit it, with a model of the beam's spot at the
+    edge. Centre and normal are in the camera frame; the normal points towards the LiDAR.
+
+    Parameters
+    ----------
+    source
+        Folder of a sweep recording, or a cloud seen from its origin.
+    calibration
+        The turntable's calibration file, for a recording.
+    hole
+        Look for round holes in a plane instead of disks.
+    never_stops
+        The turntable turned on during the sweeps: interpolate its readings by time_s.npy.
+    """
+    from lidarpose.cli.console import print_json
+    from lidarpose.cli.measure_input import measurement_input
+    from lidarpose.workflows.measuring import measure_disk as measure
+
+    recording, turntable = measurement_input(source, calibration, never_stops)
+    found = measure(recording, turntable, "hole" if hole else "disk")
+    remarks = _remarks(found)
+    if json:
+        others = [_document(m) for m in found[1:]]
+        print_json({**_document(found[0]), "frame": "camera", "others": others, "remarks": remarks})
+    else:
+        _print(found, remarks)
+
+
+def _document(m: RoundMeasurement) -> dict[str, Any]:
+    calibration_mm = None if m.calibration_sigma_m is None else 1e3 * m.calibration_sigma_m
+    return {
+        "kind": m.kind,
+        "diameter_mm": 1e3 * m.diameter_m,
+        "sigma_mm": 1e3 * m.sigma_m,
+        "sigma_parts_mm": {
+            "edge": 1e3 * m.edge_sigma_m,
+            "plane": 1e3 * m.plane_sigma_m,
+            "calibration": calibration_mm,
+        },
+        "centre_m": m.centre.tolist(),
+        "normal": m.normal.tolist(),
+        "outermost_diameter_mm": 1e3 * m.outermost_diameter_m,
+        "spot_mm": 4e3 * m.edge.spot_m,
+        "plane_rms_mm": 1e3 * m.plane_rms_m,
+        "plane_beams": m.plane_beams,
+        "edge_beams": m.edge_beams,
+        "edge_covered": m.covered,
+        "open_share": m.open_share,
+    }
+
+
+def _remarks(found: list[RoundMeasurement]) -> list[str]:
+    best = found[0]
+    remarks = []
+    if best.calibration_sigma_m is None:
+        remarks.append("the calibration carries no covariance: sigma_mm holds the edge and the plane alone")
+    if best.open_share > 0.3:
+        remarks.append(
+            "nothing returns from behind part of the edge: a beam is taken to be seen there if at least half of its "
+            "spot is on the material; another detection threshold would change the diameter by up to a spot's width"
+        )
+    if best.covered < 0.5:
+        remarks.append(f"only {100 * best.covered:.0f} % of the edge is free")
+    return remarks
+
+
+def _print(found: list[RoundMeasurement], remarks: list[str]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from lidarpose.cli.console import out
+
+    table = Table(box=SIMPLE_HEAD)
+    columns = ("", "diameter mm", "± mm", "centre m (camera frame)", "normal", "outermost points mm")
+    for column in columns:
+        table.add_column(column, justify="right")
+    for m in found:
+        centre = " ".join(f"{x:+.4f}" for x in m.centre)
+        normal = " ".join(f"{x:+.4f}" for x in m.normal)
+        outermost = f"{1e3 * m.outermost_diameter_m:.2f}"
+        table.add_row(m.kind, f"{1e3 * m.diameter_m:.3f}", f"{1e3 * m.sigma_m:.3f}", centre, normal, outermost)
+    out().print(table)
+    for remark in remarks:
+        out().print(f"Note: {remark}.")
