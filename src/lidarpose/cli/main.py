@@ -31,6 +31,10 @@ _GROUPS: dict[str, tuple[str, dict[str, tuple[str, str]]]] = {
     "simulate": (
         "Make up a session or recording with its truth beside it.",
         {
+            "turntable": (
+                "lidarpose.cli.simulate_turntable:simulate_turntable",
+                "A LiDAR on a turntable before a camera and a V board.",
+            ),
             "corners": (
                 "lidarpose.cli.simulate_corners:simulate_corners",
                 "A target of three faces moved from place to place before a 3D LiDAR.",

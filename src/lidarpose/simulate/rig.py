@@ -55,6 +55,8 @@ _LEAST_CHORD_M = 0.12
 _LEAST_SHARE_OF_GOOD_PLACES = 0.97
 _LARGEST_INCIDENCE_RAD = float(np.deg2rad(66.0))
 _ATTEMPTS = 600
+# No scan plane stays on a V board over more than this.
+_LARGEST_ARC_DEG = 90.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,14 +243,14 @@ def draw_rig(
     the_camera, the_panels = camera or paper_camera(), panels or paper_panels()
     if not (np.isfinite(range_sigma_m) and range_sigma_m >= 0.0):
         raise InputError("--range-sigma-mm", f"found {1e3 * range_sigma_m:g}", expected="a number of 0 or more")
-    for _ in range(_ATTEMPTS):
+    arc_deg = float(np.rad2deg(np.ptp(angles)))
+    for _ in range(_ATTEMPTS if arc_deg <= _LARGEST_ARC_DEG else 0):
         rig = _draw_once(rng, ranges, the_camera, the_panels, margin_m, angles, placements)
         if rig is not None and _is_good(rig):
             return replace(rig, range_sigma_m=range_sigma_m, family=family, seed=seed)
-    arc = np.rad2deg(np.ptp(angles))
     raise InputError(
         "simulated rig",
-        f"found no rig of the family {family!r} whose scan plane stays on both panels over {arc:.1f} degrees",
+        f"found no rig of the family {family!r} whose scan plane stays on both panels over {arc_deg:.1f} degrees",
         expected="a smaller arc (places times step)",
     )
 

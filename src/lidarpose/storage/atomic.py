@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,6 +46,38 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
         raise InputError(path, f"cannot be written: {error.strerror or error}") from error
 
 
+@contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """Give a temporary folder beside `path`; on success it takes the place of `path`, else it is removed.
+
+    What stood at `path` before is deleted in the end: the caller decides whether that may be.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made or written to.
+    """
+    path = Path(path).resolve()
+    mark = f"{_MARK}{os.getpid()}-{secrets.token_hex(4)}"
+    temporary, old = path.with_name(path.name + mark), path.with_name(path.name + mark + "-old")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        restore_folder(path)
+        temporary.mkdir()
+        try:
+            yield temporary
+            if path.exists():
+                path.rename(old)
+            temporary.rename(path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+            if old.exists() and not path.exists():
+                old.rename(path)
+            shutil.rmtree(old, ignore_errors=True)
+    except OSError as error:
+        raise InputError(path, f"cannot be written: {error.strerror or error}") from error
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file, whole or not at all."""
     with replacing(path) as temporary:
@@ -64,6 +97,19 @@ def _clean_left_overs(path: Path) -> None:
         process = left.name.split(_MARK, 1)[1].split("-", 1)[0]
         if not (process.isdigit() and _is_alive(int(process))):
             left.unlink(missing_ok=True)
+
+
+def restore_folder(path: Path) -> None:
+    """Clean what killed runs of `replacing_folder` left; a folder that one had moved aside comes back to its place."""
+    path = path.resolve()
+    for left in path.parent.glob(f"{_escape(path.name)}{_MARK}*"):
+        process = left.name.split(_MARK, 1)[1].split("-", 1)[0]
+        if process.isdigit() and not _is_alive(int(process)) and left.is_dir():
+            if left.name.endswith("-old") and not path.exists():
+                # Killed between the two renames: what stood there before comes back.
+                left.rename(path)
+            else:
+                shutil.rmtree(left, ignore_errors=True)
 
 
 def _escape(text: str) -> str:
