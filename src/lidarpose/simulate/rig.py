@@ -213,6 +213,7 @@ def draw_rig(
     camera: Camera | None = None,
     panels: tuple[Panel, Panel] | None = None,
     margin_m: float = 0.015,
+    dihedral_deg: float | None = None,
 ) -> TurntableRig:
     """A rig of a family, by a seed: the same seed gives the same rig.
 
@@ -227,6 +228,8 @@ def draw_rig(
         Standard deviation of the ranges.
     placements
         How often the board is put up; every placement is seen from all readings.
+    dihedral_deg
+        Angle between the panels' faces; about 120 degrees unless given. 180 makes them one plane.
 
     Raises
     ------
@@ -236,6 +239,8 @@ def draw_rig(
     if family not in _FAMILY_RANGES:
         raise InputError("--family", f"{family!r} is no family", expected=" or ".join(FAMILIES))
     ranges = _FAMILY_RANGES[family]
+    if dihedral_deg is not None:
+        ranges = replace(ranges, dihedral=(dihedral_deg, dihedral_deg))
     rng = np.random.default_rng([seed, FAMILIES.index(family)])
     angles = np.deg2rad(_draw_readings_deg(rng, ranges, places, step_deg, start_deg))
     if placements < 1:

@@ -56,6 +56,8 @@ class SimulatedSession:
     session: TurntableSession
     rig: TurntableRig
     truth: dict[str, Any]
+    photography: Photography
+    options: SimulationOptions
 
 
 def simulate_session(
@@ -91,7 +93,8 @@ def simulate_session(
         places.append(TurntablePlace(f"{k:03d}", float(rig.turntable_angle_rad[k]), stripe, scan, rig.placement[k]))
     name = f"simulated {rig.family} {the_seed}"
     session = TurntableSession(name, rig.camera, rig.panels, board_images, tuple(places), rig.lidar)
-    return SimulatedSession(session, rig, describe_truth(rig, the_seed, photography, how))
+    truth = describe_truth(rig, the_seed, photography, how)
+    return SimulatedSession(session, rig, truth, photography, how)
 
 
 def draw_photography(seed: int) -> Photography:
