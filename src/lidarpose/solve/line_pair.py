@@ -70,76 +70,79 @@ class LinePair:
     covariance: FloatArray
 
 
-def fit_scan_line(scan_line: ScanLine) -> FittedLine:
-    """Robust, weighted line through a scan line's points.
+def fit_scan_line(scan_line: ScanLine, *, robust: bool = True) -> FittedLine:
+    """Weighted line through a scan line's points.
 
-    A point weighs by its range's standard deviation seen across the line. Raises ValueError for fewer than two points.
+    A point weighs by its range's standard deviation seen across the line; with `robust`, by Tukey's biweight too.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two points.
     """
     points, beams = scan_line.points_lidar(), _beams(scan_line)
     if len(points) < 2:
         raise ValueError("a scan line needs two points")
     line = fit_line2(points)
-    weight = np.ones(len(points))
-    for _ in range(10):
+    sigma = _sigma_across(line.normal, beams, scan_line.sigma_m)
+    weight = 1.0 / sigma**2
+    for _ in range(10 if robust else 1):
+        line = fit_line2(points, weight)
         sigma = _sigma_across(line.normal, beams, scan_line.sigma_m)
-        standardised = line.distance(points) / sigma
-        weight = tukey_weights(standardised / max(1.0, mad_sigma(standardised, centred=True))) / sigma**2
-        refined = fit_line2(points, weight)
-        done = abs(abs(refined.normal @ line.normal) - 1.0) < 1e-15 and len(points) > 2
-        line = refined
-        if done:
+        previous, weight = weight, 1.0 / sigma**2
+        if robust:
+            standardised = line.distance(points) / sigma
+            weight = weight * tukey_weights(standardised / max(1.0, mad_sigma(standardised, centred=True)))
+        if np.abs(weight - previous).max() <= 1e-6 * previous.max():
             break
     middle = weight @ points / weight.sum()
     along = (points - middle) @ line.direction
-    excess = max(1.0, float(weight @ line.distance(points) ** 2) / max(1, int(np.count_nonzero(weight)) - 2))
-    inlying = line.distance(points[weight > 0.0])
+    used = weight > 0.0
+    excess = max(1.0, float(weight @ line.distance(points) ** 2) / max(1, int(np.count_nonzero(used)) - 2))
     return FittedLine(
         line,
         line.project(middle),
         line.project(points[[0, -1]]),
         float(np.sqrt(excess / max(float(weight @ along**2), 1e-300))),
         float(np.sqrt(excess / weight.sum())),
-        float(np.sqrt(np.mean(inlying**2))),
+        float(np.sqrt(np.mean(line.distance(points[used]) ** 2))),
     )
 
 
-def fit_line_pair(first: ScanLine, second: ScanLine, alpha_rad: float) -> LinePair:
-    """Both lines at once, with the angle between them held at `alpha_rad` (eqs. (7) to (12)).
+def fit_line_pair(first: FittedLine, second: FittedLine, alpha_rad: float) -> LinePair:
+    """Both lines with the angle between them held at `alpha_rad` (eqs. (7) to (12)).
 
-    Three numbers are estimated: the direction of the first line and both offsets. Weighted and robust as
-    `fit_scan_line`; which side the second line lies to is taken from the lines fitted apart.
+    The three numbers of the paper are the direction of the first line and both offsets. Where each line's direction
+    and its offset at the middle of its points are independent, as least squares makes them, the offsets stay, and the
+    misfit of alpha is shared according to how well each direction is known: that is the paper's fit, solved exactly
+    up to the square of the misfit. Which side the second line lies to is taken from the lines fitted apart.
 
     Raises
     ------
     ValueError
-        If a line has fewer than two points, or the two are parallel.
+        If the lines are parallel.
     """
-    fitted = (fit_scan_line(first), fit_scan_line(second))
-    free = free_directions(*fitted)
+    fitted = (first, second)
+    free = free_directions(first, second)
     turn = alpha_rad if _cross(*free) > 0.0 else -alpha_rad
-    points = (first.points_lidar(), second.points_lidar())
-    beams = (_beams(first), _beams(second))
-    stated = (first.sigma_m, second.sigma_m)
-    # Start where the misfit of alpha is shared by both lines, each according to how well its direction is known.
     angles = np.arctan2(free[:, 1], free[:, 0])
-    misfit = (angles[1] - angles[0] - turn + np.pi) % (2.0 * np.pi) - np.pi
-    variances = np.array([f.direction_sigma_rad**2 for f in fitted])
+    misfit = float((angles[1] - angles[0] - turn + np.pi) % (2.0 * np.pi) - np.pi)
+    variances = np.array([first.direction_sigma_rad**2, second.direction_sigma_rad**2])
     beta = float(angles[0] + misfit * variances[0] / variances.sum())
-    weights: list[FloatArray] = []
-    for _ in range(20):
-        normals = [_normal(beta), _normal(beta + turn)]
-        weights = [_weights(n, p, b, s) for n, p, b, s in zip(normals, points, beams, stated, strict=True)]
-        change = _turn_to_fit(normals, points, weights)
-        beta += change
-        if abs(change) < 1e-15:
-            break
-    normals = [_normal(beta), _normal(beta + turn)]
-    lines = [Line2(n, float(w @ (p @ n) / w.sum())) for n, p, w in zip(normals, points, weights, strict=True)]
+    normals = (_normal(beta), _normal(beta + turn))
+    lines = [Line2(n, float(n @ f.middle)) for n, f in zip(normals, fitted, strict=True)]
     E = lines[0].intersection(lines[1])
     directions = np.stack([_leaving(E, line, f.middle) for line, f in zip(lines, fitted, strict=True)])
     extents = np.stack([np.sort((f.ends - E) @ d) for f, d in zip(fitted, directions, strict=True)])
-    rms, covariance = _spread(lines, points, weights)
-    return LinePair((lines[0], lines[1]), E, directions, alpha_rad, extents, rms, covariance)
+    return LinePair(
+        (lines[0], lines[1]),
+        E,
+        directions,
+        alpha_rad,
+        extents,
+        float(np.hypot(first.rms_m, second.rms_m) / np.sqrt(2.0)),
+        _covariance(lines, fitted),
+    )
 
 
 def free_directions(first: FittedLine, second: FittedLine) -> FloatArray:
@@ -148,38 +151,15 @@ def free_directions(first: FittedLine, second: FittedLine) -> FloatArray:
     return np.stack([_leaving(E, fitted.line, fitted.middle) for fitted in (first, second)])
 
 
-def _spread(
-    lines: list[Line2], points: tuple[FloatArray, FloatArray], weights: list[FloatArray]
-) -> tuple[float, FloatArray]:
-    """Root mean square distance, and covariance (3, 3) of (x, y, turn) in the scan plane."""
-    p, w = np.vstack(points), np.concatenate(weights)
-    n = np.vstack([np.broadcast_to(line.normal, q.shape) for line, q in zip(lines, points, strict=True)])
-    distance = np.concatenate([line.distance(q) for line, q in zip(lines, points, strict=True)])
-    rows = np.column_stack([n, p[:, 0] * n[:, 1] - p[:, 1] * n[:, 0]])
-    used = int(np.count_nonzero(w))
-    excess = max(1.0, float(w @ distance**2) / max(1, used - 3))
-    covariance = np.linalg.inv(rows.T @ (rows * w[:, None])) * excess
-    return float(np.sqrt(np.mean(distance[w > 0.0] ** 2))), np.asarray(covariance)
-
-
-def _turn_to_fit(normals: list[FloatArray], points: tuple[FloatArray, FloatArray], weights: list[FloatArray]) -> float:
-    """Newton's step of the common turn, with both offsets eliminated: exact up to the turn's own square."""
-    slope, curvature = 0.0, 0.0
-    for normal, p, w in zip(normals, points, weights, strict=True):
-        centred = p - w @ p / w.sum()
-        across = centred @ normal
-        along = centred @ np.array([-normal[1], normal[0]])
-        slope += float(w @ (across * along))
-        curvature += float(w @ (along**2 - across**2))
-    return -slope / curvature if curvature > 0.0 else 0.0
-
-
-def _weights(normal: FloatArray, points: FloatArray, beams: FloatArray, stated: FloatArray) -> FloatArray:
-    sigma = _sigma_across(normal, beams, stated)
-    across = points @ normal
-    standardised = (across - np.median(across)) / sigma
-    scale = max(1.0, mad_sigma(standardised))
-    return np.asarray(tukey_weights(standardised / scale) / sigma**2)
+def _covariance(lines: list[Line2], fitted: tuple[FittedLine, FittedLine]) -> FloatArray:
+    """Covariance (3, 3) of (x, y, turn) in the scan plane."""
+    rows = []
+    for line, f in zip(lines, fitted, strict=True):
+        n, m = line.normal, f.middle
+        rows.append(np.array([n[0], n[1], m[0] * n[1] - m[1] * n[0]]) / f.offset_sigma_m)
+        rows.append(np.array([0.0, 0.0, 1.0 / f.direction_sigma_rad]))
+    J = np.stack(rows)
+    return np.asarray(np.linalg.inv(J.T @ J))
 
 
 def _sigma_across(normal: FloatArray, beams: FloatArray, stated: FloatArray) -> FloatArray:

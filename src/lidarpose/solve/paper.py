@@ -15,7 +15,7 @@ from lidarpose.geometry.se3 import UncertainPose
 from lidarpose.model.observation import LeftOut, PanelCorners, PlaceObservation, TurntableObservations
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.solve.light_plane import stripe_on_panel, stripe_pair
-from lidarpose.solve.line_pair import fit_line_pair
+from lidarpose.solve.line_pair import fit_line_pair, fit_scan_line
 from lidarpose.solve.panel_pose import PanelPose, panel_pose
 from lidarpose.solve.single_pose import single_pose
 from lidarpose.solve.turntable_function import (
@@ -145,5 +145,5 @@ def sample_pose(
     stripes = stripe_pair((Plane.from_pose(poses[0]), Plane.from_pose(poses[1])), (points[0], points[1]))
     if min(stripes.alpha_rad, np.pi - stripes.alpha_rad) < LEAST_ANGLE_RAD:
         raise ValueError("the two stripes are nearly parallel, so the LiDAR may slide along them")
-    lines = fit_line_pair(place.scan_lines[0], place.scan_lines[1], stripes.alpha_rad)
+    lines = fit_line_pair(fit_scan_line(place.scan_lines[0]), fit_scan_line(place.scan_lines[1]), stripes.alpha_rad)
     return single_pose(stripes, lines)

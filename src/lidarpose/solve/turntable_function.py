@@ -174,7 +174,7 @@ def require_readings(angles: FloatArray) -> None:
 def _start_from_pairs(angles: FloatArray, R: FloatArray, t: FloatArray) -> tuple[Pose, Pose]:
     """The motion of the pair of places that most places agree with (least median)."""
     best: tuple[float, Pose, Pose] | None = None
-    for i, j in _wide_pairs(angles):
+    for i, j in wide_pairs(angles):
         T_w, T_m = motion_of_pair(angles[[i, j]], R[[i, j]], t[[i, j]])
         e = _residuals(angles, R, t, T_w, T_m)
         # A radian counts as a metre: scores are only compared among the pairs of one session.
@@ -209,7 +209,7 @@ def motion_axis(R_first: FloatArray, R_second: FloatArray, turn_rad: float) -> F
     return np.asarray(unit(vector if folded >= 0.0 else -vector))
 
 
-def _wide_pairs(angles: FloatArray) -> list[tuple[int, int]]:
+def wide_pairs(angles: FloatArray) -> list[tuple[int, int]]:
     """Pairs of places, those first whose turn shows the axis best, spread over all places."""
     i, j = np.triu_indices(len(angles), 1)
     # Best is a right angle; short turns and nearly whole ones show little, half a turn hides its sense.
