@@ -96,13 +96,16 @@ def make_rig(
     tilt_deg: float = 3.0,
     dihedral_deg: float = 120.0,
     across: bool = False,
+    symmetric: bool = False,
 ) -> Rig:
     """A rig about as in the paper; `across` has the scan plane perpendicular to the axis, fold and axis parallel.
 
     The board's fold is the camera's x axis (or y, if `across`) 1.5 m away; panels rise from it towards the camera.
+    With `symmetric` the board is its own mirror image in a plane across the axis, as the scan plane is.
     """
     rng = np.random.default_rng(seed)
-    wobble = Pose.exp(rng.normal(size=6) * [0.02, 0.02, 0.05, 0.03, 0.03, 0.03])
+    wobble = Pose.exp(rng.normal(size=6) * [0.02, 0.02, 0.05, 0.03, 0.03, 0.03] * (not symmetric))
+    tilt_deg = 0.0 if symmetric else tilt_deg
     half = np.deg2rad(dihedral_deg) / 2
     sides = []
     for sign in (1.0, -1.0):
@@ -125,7 +128,7 @@ def make_rig(
         z = -z
     x = np.cross(np.cross(z, towards), z)
     x = x / np.linalg.norm(x)
-    R_middle = exp_so3(0.02 * rng.normal(size=3)) @ np.column_stack([x, np.cross(z, x), z])
+    R_middle = exp_so3(0.02 * rng.normal(size=3) * (not symmetric)) @ np.column_stack([x, np.cross(z, x), z])
     middle = np.deg2rad(first_deg + arc_deg / 2)
     u = np.cross(axis, rng.normal(size=3))
     T_camera_table = Pose(_about(axis), base - radius_m * u / np.linalg.norm(u))

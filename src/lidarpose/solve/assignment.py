@@ -12,14 +12,16 @@ alone cannot tell. What can:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import permutations
 
 import numpy as np
 
 from lidarpose.errors import InputError, UndeterminedError
-from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
-from lidarpose.geometry.planes import Plane
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, angle_between
+from lidarpose.geometry.planes import Plane, fit_plane, intersect_three_planes
 from lidarpose.geometry.se3 import Pose, UncertainPose, log_so3, rotation_z
 from lidarpose.model.camera import Camera
 from lidarpose.model.observation import LeftOut, PlaceFeatures, PlaceObservation, ScanLine
@@ -38,16 +40,25 @@ FOLD_SLACK_M = 0.03
 # Shares of a stripe that its scan line covers, and of a scan line that its stripe covers, at least.
 LEAST_STRIPE_COVERED = 0.5
 LEAST_LINE_COVERED = 0.35
-# Motions from pairs of places that are tried, at most.
-HYPOTHESES = 400
+# Pairs of places whose motions are tried.
+PAIRS = 24
 REFINED = 6
 # A place supports a motion up to this many of its own sigmas (times what the other places show).
 SUPPORT_SIGMAS = 6.0
 # Residuals of this size are no evidence against a place: panels and cameras are never quite what the model says.
 SLACK_SIGMAS = 20.0
-# One solution beats another where its residuals are this much smaller, and that is no chance (odds of the F test).
+# One solution beats another where its residuals are this much smaller at least, and that is no chance: the logarithm of
+# the ratio of two equal deviations with n degrees of freedom scatters by sqrt(1/n) (more for small n).
 LEAST_RATIO = 2.0
-LARGEST_CHANCE = 1e-6
+LEAST_DEVIATIONS = 5.0
+# What a panel's pose may be wrong by beyond twice its stated deviation, because neither boards nor lenses are perfect,
+# before one solution is held for better than another.
+PANEL_TURN_RAD = 3e-4
+PANEL_SHIFT_M = 2e-4
+# A rival whose places are off by this much needs no closer look.
+FAR_OFF_RAD = 0.005
+# Places that the closer look takes.
+LOOKED_AT = 10
 # ... or where the lines' ends agree so much better with the stripes' ends (difference of chi-squared).
 LEAST_ENDS_GAIN = 30.0
 # How unequally the ends of stripes may be cut off on both panels, by detection or by margins.
@@ -90,8 +101,10 @@ class _Candidate:
     lines: tuple[int, int]
     sample: UncertainPose
     extents_m: FloatArray
-    stripe_extents_m: FloatArray
     spacing_m: float
+    fits: tuple[FittedLine, FittedLine]
+    stripes: StripePair
+    rays_camera: tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +181,7 @@ def assign(
             "and that the board did not move",
             details=_details(places, reasons),
         )
-    best, decided_by, figures = _decide(pool, solutions, places, first_panel)
+    best, decided_by, figures = _decide(pool, solutions, places, panel_poses, first_panel)
     return _assignment(pool, best, places, reasons, decided_by, figures)
 
 
@@ -178,7 +191,7 @@ def assign(
 def _candidates(camera: Camera, poses: Sequence[PanelPose], index: int, place: PlaceFeatures) -> list[_Candidate]:
     """Ordered pairs of a place's lines that may be the board. Raises ValueError with the reason if there is none."""
     panels = [Plane.from_pose(p.T_camera_panel) for p in poses]
-    stripes = _stripes(camera, poses, place)
+    stripes, rays = _stripes(camera, poses, place)
     if len(place.lines) < 2:
         raise ValueError(f"the scan shows {len(place.lines)} straight lines; the board needs two")
     fits = [fit_scan_line(line, robust=False) for line in place.lines]
@@ -190,28 +203,26 @@ def _candidates(camera: Camera, poses: Sequence[PanelPose], index: int, place: P
         # The panels show their faces to the camera, at the origin: the LiDAR must stand on the same side.
         if all(plane.distance(centre) * -plane.offset > 0.0 for plane in panels):
             spacing = max(_spacing(place.lines[i]), _spacing(place.lines[j]))
-            found.append(_Candidate(index, (i, j), sample, lines.extents_m, stripes.extents_m, spacing))
+            found.append(_Candidate(index, (i, j), sample, lines.extents_m, spacing, (fits[i], fits[j]), stripes, rays))
     if not found:
         raise ValueError("no two lines of the scan match the two stripes in angle, length and side")
     return found
 
 
-def _stripes(camera: Camera, poses: Sequence[PanelPose], place: PlaceFeatures) -> StripePair:
+def _stripes(
+    camera: Camera, poses: Sequence[PanelPose], place: PlaceFeatures
+) -> tuple[StripePair, tuple[FloatArray, FloatArray]]:
     for key in (0, 1):
         if key not in place.stripes or len(place.stripes[key]) < LEAST_STRIPE_POINTS:
             raise ValueError(f"no usable stripe on panel {key + 1}")
     T = [poses[key].T_camera_panel for key in (0, 1)]
     on = [stripe_on_panel(camera, T[key], place.stripes[key]) for key in (0, 1)]
-    return stripe_pair((Plane.from_pose(T[0]), Plane.from_pose(T[1])), (on[0], on[1]))
+    pair = stripe_pair((Plane.from_pose(T[0]), Plane.from_pose(T[1])), (on[0], on[1]))
+    return pair, (on[0].rays_camera, on[1].rays_camera)
 
 
 def _plausible_pairs(fits: list[FittedLine], stripes: StripePair) -> list[tuple[int, int]]:
-    pairs = []
-    for i in range(len(fits)):
-        for j in range(len(fits)):
-            if i != j and _plausible(fits[i], fits[j], stripes):
-                pairs.append((i, j))
-    return pairs
+    return [(i, j) for i, j in permutations(range(len(fits)), 2) if _plausible(fits[i], fits[j], stripes)]
 
 
 def _plausible(first: FittedLine, second: FittedLine, stripes: StripePair) -> bool:
@@ -281,14 +292,14 @@ def _solutions(pool: _Pool) -> list[_Solution]:
     scored = sorted(_hypotheses(pool), key=lambda item: item[0])
     found: list[_Solution] = []
     starts: set[bytes] = set()
-    for _, chosen in scored:
+    for _, chosen, start in scored:
         if len(starts) >= REFINED:
             break
         if chosen.tobytes() in starts:
             continue
         starts.add(chosen.tobytes())
-        _add(found, _refined(pool, chosen))
-    for solution in list(found):
+        _add(found, _refined(pool, chosen, start))
+    for solution in found:
         _add(found, _refined(pool, _exchanged(pool, solution.chosen), rechoose=False))
     return sorted(found, key=lambda s: _score(s.misfit))
 
@@ -304,25 +315,21 @@ def _score(misfit: FloatArray) -> float:
         return float(np.mean(np.where(np.isfinite(misfit), misfit**2 / (misfit**2 + SLACK_SIGMAS**2), 1.0)))
 
 
-def _hypotheses(pool: _Pool) -> list[tuple[float, IntArray]]:
+def _hypotheses(pool: _Pool) -> list[tuple[float, IntArray, TurntableMotion]]:
     """Motions through two candidates of two places: each one's score and what it makes every place choose."""
     present = np.unique(pool.place)
     angle_of = {int(p): pool.angle_rad[pool.place == p][0] for p in present}
-    pairs = wide_pairs(np.array([angle_of[int(p)] for p in present]))
-    scored: list[tuple[float, IntArray]] = []
-    tried = 0
+    pairs = wide_pairs(np.array([angle_of[int(p)] for p in present]), PAIRS)
+    scored: list[tuple[float, IntArray, TurntableMotion]] = []
     for i, j in pairs:
-        if tried >= HYPOTHESES:
-            break
         for a in np.flatnonzero(pool.place == present[i]):
             for b in np.flatnonzero(pool.place == present[j]):
                 if not _turn_agrees(pool, int(a), int(b)):
                     continue
-                tried += 1
                 both = [int(a), int(b)]
                 motion = motion_of_pair(pool.angle_rad[both], pool.rotation[both], pool.translation[both])
                 chosen, misfit = _choose(pool, pool.misfits(*motion))
-                scored.append((_score(misfit), chosen))
+                scored.append((_score(misfit), chosen, TurntableMotion.from_any_frame(*motion)))
     return scored
 
 
@@ -331,7 +338,7 @@ def _turn_agrees(pool: _Pool, a: int, b: int) -> bool:
     turned = float(np.linalg.norm(log_so3(pool.rotation[b] @ pool.rotation[a].T)))
     table = abs(float((pool.angle_rad[b] - pool.angle_rad[a] + np.pi) % (2.0 * np.pi) - np.pi))
     sigma = np.sqrt(sum(np.trace(pool.candidates[k].sample.rotation_covariance()) for k in (a, b)))
-    return abs(turned - table) < np.deg2rad(1.0) + 6.0 * float(sigma)
+    return bool(abs(turned - table) < np.deg2rad(1.0) + 6.0 * float(sigma))
 
 
 def _choose(pool: _Pool, misfits: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -344,7 +351,9 @@ def _choose(pool: _Pool, misfits: FloatArray) -> tuple[IntArray, FloatArray]:
     return chosen, misfit
 
 
-def _refined(pool: _Pool, chosen: IntArray, *, rechoose: bool = True) -> _Solution | None:
+def _refined(
+    pool: _Pool, chosen: IntArray, start: TurntableMotion | None = None, *, rechoose: bool = True
+) -> _Solution | None:
     """The motion through all chosen candidates, and what every place chooses then; None if it falls apart."""
     solution: _Solution | None = None
     for _ in range(5):
@@ -354,6 +363,7 @@ def _refined(pool: _Pool, chosen: IntArray, *, rechoose: bool = True) -> _Soluti
                 list(pool.angle_rad[have]),
                 [pool.candidates[c].sample.pose for c in have],
                 [pool.candidates[c].sample.covariance for c in have],
+                start=start,
             )
         except UndeterminedError:
             return solution
@@ -363,6 +373,7 @@ def _refined(pool: _Pool, chosen: IntArray, *, rechoose: bool = True) -> _Soluti
         else:
             again, misfit = chosen, np.where(chosen >= 0, misfits[chosen], np.inf)
         solution = _Solution(again, fitted.motion, misfit)
+        start = fitted.motion
         if np.array_equal(again, chosen):
             break
         chosen = again
@@ -384,12 +395,17 @@ def _exchanged(pool: _Pool, chosen: IntArray) -> IntArray:
 
 
 def _decide(
-    pool: _Pool, solutions: list[_Solution], places: Sequence[PlaceFeatures], first_panel: int | None
+    pool: _Pool,
+    solutions: list[_Solution],
+    places: Sequence[PlaceFeatures],
+    panel_poses: Mapping[str, Sequence[PanelPose]],
+    first_panel: int | None,
 ) -> tuple[_Solution, str, dict[str, float]]:
     """The solution that the evidence is for, what decided, and the figures. Raises where nothing decides."""
     best = solutions[0]
     figures = {"solutions": float(len(solutions)), "rms_sigmas": _rms(best.misfit, _support(best))}
-    rivals = [s for s in solutions[1:] if not _beaten_by_motion(best, s)]
+    look = partial(_rms_with_panels, pool, places, panel_poses)
+    rivals = [s for s in solutions[1:] if not _beaten_by_motion(pool, best, s, look)]
     if len(solutions) > 1:
         figures["rival_rms_sigmas"] = min(_rms(s.misfit, _support(best)) for s in solutions[1:])
     decided_by = "the motion of all places" if len(solutions) > 1 else "no rival"
@@ -459,18 +475,97 @@ def _rms(misfit: FloatArray, support: BoolArray) -> float:
     return float(np.sqrt(np.mean(least**2))) if n and np.isfinite(least).all() else float("inf")
 
 
-def _beaten_by_motion(best: _Solution, rival: _Solution) -> bool:
-    """Whether the rival's places fit one motion so much worse that chance is out of the question."""
-    from scipy.special import fdtrc
-
+def _beaten_by_motion(
+    pool: _Pool, best: _Solution, rival: _Solution, look: Callable[[_Solution, IntArray], float]
+) -> bool:
+    """Whether the rival's places fit one motion so much worse that neither chance nor the panels' poses explain it."""
     support = _support(best)
-    freedom = 6 * int(support.sum()) - 10
-    # Residuals far below the stated sigma are rounding, not evidence.
-    ours, theirs = max(_rms(best.misfit, support), 0.02), _rms(rival.misfit, support)
+    ours, theirs = _rms(best.misfit, support), _rms(rival.misfit, support)
     if not np.isfinite(theirs):
         return True
-    ratio = theirs / ours
-    return bool(ratio >= LEAST_RATIO and fdtrc(freedom, freedom, ratio**2) < LARGEST_CHANCE)
+    smallest = np.median([np.linalg.eigvalsh(c.sample.rotation_covariance())[0] for c in pool.candidates])
+    both = np.flatnonzero(support & (rival.chosen >= 0))
+    if len(both) < 3 or theirs * np.sqrt(smallest) < FAR_OFF_RAD:
+        both = both[np.unique(np.linspace(0, len(both) - 1, LOOKED_AT).astype(int))]
+        ours, theirs = look(best, both), look(rival, both)
+    else:
+        both = np.flatnonzero(support)
+    # Residuals far below the stated sigma are rounding, not evidence.
+    ratio = theirs / max(ours, 0.02)
+    freedom = max(6 * len(both) - 10, 1)
+    needed = LEAST_DEVIATIONS / np.sqrt(freedom) * (1.0 + 5.0 / freedom)
+    return bool(ratio > LEAST_RATIO and np.log(ratio) > needed)
+
+
+def _rms_with_panels(
+    pool: _Pool,
+    places: Sequence[PlaceFeatures],
+    panel_poses: Mapping[str, Sequence[PanelPose]],
+    solution: _Solution,
+    which: IntArray,
+) -> float:
+    """Root mean square misfit, in sigmas, of some places once the panels' poses may give way within their uncertainty.
+
+    An error of a panel's pose moves all samples together. The right solution hardly shows it, a mirrored one does, so
+    without this the panels' noise would decide between solutions that are equally good. One linear least squares
+    problem: motion and panels, with the panels' prior.
+    """
+    names = sorted({places[k].placement for k in which})
+    chosen = solution.chosen[which]
+    rows, right = [], []
+    for k, c in zip(which, chosen, strict=True):
+        candidate = pool.candidates[c]
+        poses = panel_poses[places[k].placement]
+        to_motion = solution.motion.pose_jacobian(pool.angle_rad[c])
+        back = solution.motion.pose(pool.angle_rad[c]).inverse().adjoint()
+        root = np.linalg.cholesky(pool.information[c]).T
+        e = back @ candidate.sample.pose.minus(solution.motion.pose(pool.angle_rad[c]))
+        by_panels = np.zeros((6, 12 * len(names)))
+        at = 12 * names.index(places[k].placement)
+        by_panels[:, at : at + 12] = back @ _moved_by_panels(candidate, poses)
+        rows.append(root @ np.hstack([-back @ to_motion, by_panels]))
+        right.append(root @ e)
+    prior = np.hstack([np.zeros((12 * len(names), 10)), np.eye(12 * len(names))])
+    A = np.vstack([*rows, prior])
+    b = np.concatenate([*right, np.zeros(len(prior))])
+    rest = b - A @ np.linalg.lstsq(A, b, rcond=1e-12)[0]
+    return float(np.sqrt(rest @ rest / (6 * len(which))))
+
+
+def _moved_by_panels(candidate: _Candidate, poses: Sequence[PanelPose]) -> FloatArray:
+    """How a sample moves (6, 12), as left perturbation, for one deviation of each panel's pose in each direction."""
+    T = [poses[key].T_camera_panel for key in (0, 1)]
+    reference = _sample_on(candidate, (T[0], T[1]))
+    columns = []
+    for key in (0, 1):
+        middle = Pose(np.eye(3), candidate.stripes.E_camera).adjoint()
+        slack = np.diag([PANEL_SHIFT_M**2] * 3 + [PANEL_TURN_RAD**2] * 3)
+        spread = np.linalg.cholesky(4.0 * poses[key].covariance + middle @ slack @ middle.T)
+        for direction in 0.1 * spread.T:
+            moved = list(T)
+            moved[key] = Pose.exp(direction) @ T[key]
+            columns.append(_sample_on(candidate, (moved[0], moved[1])).minus(reference) / 0.1)
+    return np.stack(columns, axis=1)
+
+
+def _sample_on(candidate: _Candidate, T_camera_panel: tuple[Pose, Pose]) -> Pose:
+    """The sample as it were if the panels stood a little differently."""
+    planes = (Plane.from_pose(T_camera_panel[0]), Plane.from_pose(T_camera_panel[1]))
+    points = np.vstack([p.intersect_rays(r) for p, r in zip(planes, candidate.rays_camera, strict=True)])
+    stripes = candidate.stripes
+    light = fit_plane(points, np.concatenate(stripes.light_plane.weights))
+    directions = []
+    for plane, old in zip(planes, stripes.directions_camera, strict=True):
+        direction = light.intersect_plane(plane).direction
+        directions.append(direction if direction @ old > 0.0 else -direction)
+    moved = replace(
+        stripes,
+        light_plane=replace(stripes.light_plane, plane=light),
+        E_camera=intersect_three_planes((*planes, light)),
+        directions_camera=np.stack(directions),
+        alpha_rad=float(angle_between(*directions)),
+    )
+    return single_pose(moved, fit_line_pair(*candidate.fits, moved.alpha_rad)).pose
 
 
 def _ends_gain(pool: _Pool, best: _Solution, rival: _Solution) -> float:
@@ -486,7 +581,7 @@ def _ends_gain(pool: _Pool, best: _Solution, rival: _Solution) -> float:
     spacing = float(np.median([pool.candidates[best.chosen[p]].spacing_m for p in both]))
     for solution in (best, rival):
         chosen = [pool.candidates[solution.chosen[p]] for p in both]
-        off = np.stack([c.extents_m - c.stripe_extents_m for c in chosen])
+        off = np.stack([c.extents_m - c.stripes.extents_m for c in chosen])
         chi2.append(off[:, 0] - off[:, 1])
     # Scatter from place to place, of the better one, never below two beams.
     scatter = [float(np.median(np.abs(d - np.median(d, axis=0)))) * 1.4826 for d in chi2]
@@ -535,7 +630,7 @@ def _whole(place: PlaceFeatures, candidate: _Candidate, key: int) -> ScanLine:
     """The scan line of a panel with the pieces that detection may have split off it."""
     chosen = place.lines[candidate.lines[key]]
     fit = fit_scan_line(chosen, robust=False)
-    length = float(np.ptp(candidate.stripe_extents_m[key]))
+    length = float(np.ptp(candidate.stripes.extents_m[key]))
     pieces = [chosen]
     for k, other in enumerate(place.lines):
         if k in candidate.lines:

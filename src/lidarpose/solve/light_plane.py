@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, angle_between, unit
+from lidarpose.geometry.arrays import FloatArray, IntArray, angle_between, unit
 from lidarpose.geometry.planes import Plane, fit_plane, intersect_three_planes
 from lidarpose.geometry.robust import mad_sigma, tukey_weights
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.camera import Camera
 from lidarpose.model.observation import StripePoints
 
-HYPOTHESES = 200
+HYPOTHESES = 80
 # Points at which hypotheses are scored; the fit itself uses all of them.
 SCORED_POINTS = 200
 
@@ -28,10 +28,13 @@ class StripeOnPanel:
     points_camera : (N, 3)
     spread_camera : (N, 3)
         How far each point moves for one standard deviation of its pixel.
+    rays_camera : (N, 3)
+        Directions through the pixels, z = 1.
     """
 
     points_camera: FloatArray
     spread_camera: FloatArray
+    rays_camera: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +51,8 @@ class LightPlane:
         Unit vectors u, v in the plane: a small change turns the normal by ``a * u + b * v``.
     pivot : (3,)
         The weighted middle of the points: the offset's change is that of the distance there.
-    inliers
-        By stripe, which points support the plane.
+    weights
+        By stripe, the weight (N,) of each point, 1/m^2; zero for those that do not support the plane.
     rms_m
         Root mean square distance of the inliers.
     """
@@ -58,7 +61,7 @@ class LightPlane:
     covariance: FloatArray
     basis: FloatArray
     pivot: FloatArray
-    inliers: tuple[BoolArray, ...]
+    weights: tuple[FloatArray, ...]
     rms_m: float
 
 
@@ -99,7 +102,7 @@ def stripe_on_panel(camera: Camera, T_camera_panel: Pose, stripe: StripePoints) 
     moved = plane.intersect_rays(camera.rays(stripe.pixels + h * stripe.normals))
     spread = (moved - points) / h * stripe.sigma_px[:, None]
     usable = np.isfinite(points).all(axis=1) & np.isfinite(spread).all(axis=1) & (points[:, 2] > 0.0)
-    return StripeOnPanel(points[usable], spread[usable])
+    return StripeOnPanel(points[usable], spread[usable], rays[usable])
 
 
 def fit_light_plane(stripes: Sequence[StripeOnPanel], *, seed: int = 0) -> LightPlane:
@@ -118,7 +121,7 @@ def fit_light_plane(stripes: Sequence[StripeOnPanel], *, seed: int = 0) -> Light
     groups: IntArray = np.repeat(np.arange(len(stripes)), [len(s.points_camera) for s in stripes])
     if len(points) < 4:
         raise ValueError("a light plane needs at least four points of its stripes")
-    plane = _least_median_plane(points, spread, groups, seed)
+    plane = _start(points, spread, groups, seed)
     weight: FloatArray = np.ones(len(points))
     for _ in range(20):
         sigma = _sigma_across(plane, points, spread)
@@ -126,9 +129,9 @@ def fit_light_plane(stripes: Sequence[StripeOnPanel], *, seed: int = 0) -> Light
         scale = max(1.0, mad_sigma(standardised, centred=True))
         weight = tukey_weights(standardised / scale)
         refined = fit_plane(points, weight / sigma**2)
-        turned = min(angle_between(refined.normal, plane.normal), angle_between(-refined.normal, plane.normal))
+        turned = np.linalg.norm(np.cross(refined.normal, plane.normal))
         plane = refined
-        if turned < 1e-14:
+        if turned < 1e-10:
             break
     return _with_covariance(plane, points, spread, weight, groups, len(stripes))
 
@@ -148,7 +151,8 @@ def stripe_pair(
         raise ValueError("the two panels are parallel")
     E = intersect_three_planes((*panel_planes, light.plane))
     directions, extents = [], []
-    for plane, stripe, inliers in zip(panel_planes, stripes, light.inliers, strict=True):
+    for plane, stripe, weights in zip(panel_planes, stripes, light.weights, strict=True):
+        inliers = weights > 0.0
         if inliers.sum() < 2:
             raise ValueError("a stripe has fewer than two good points")
         line = light.plane.intersect_plane(plane)
@@ -166,6 +170,17 @@ def _sigma_across(plane: Plane, points: FloatArray, spread: FloatArray) -> Float
     # A point whose pixel moves it along the plane would weigh without bound.
     floor = 0.05 * np.linalg.norm(spread, axis=1)
     return np.asarray(np.maximum(np.maximum(sigma, floor), 1e-12))
+
+
+def _start(points: FloatArray, spread: FloatArray, groups: IntArray, seed: int) -> Plane:
+    """The plain fit if nothing contradicts it, else the plane of least median."""
+    try:
+        plane = fit_plane(points)
+    except ValueError:
+        return _least_median_plane(points, spread, groups, seed)
+    if np.all(np.abs(plane.distance(points)) < 4.0 * _sigma_across(plane, points, spread)):
+        return plane
+    return _least_median_plane(points, spread, groups, seed)
 
 
 def _least_median_plane(points: FloatArray, spread: FloatArray, groups: IntArray, seed: int) -> Plane:
@@ -215,5 +230,5 @@ def _with_covariance(
     covariance = np.linalg.pinv(rows.T @ (rows * information[:, None])) * excess
     rms = float(np.sqrt(np.mean(plane.distance(points[inliers]) ** 2)))
     return LightPlane(
-        plane, covariance, basis, pivot, tuple(np.asarray(inliers[groups == k]) for k in range(count)), rms
+        plane, covariance, basis, pivot, tuple(np.asarray(information[groups == k]) for k in range(count)), rms
     )

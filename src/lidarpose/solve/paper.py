@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +12,7 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import angle_between
 from lidarpose.geometry.planes import Plane
 from lidarpose.geometry.se3 import UncertainPose
+from lidarpose.model.camera import Camera
 from lidarpose.model.observation import LeftOut, PanelCorners, PlaceObservation, TurntableObservations
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.solve.light_plane import stripe_on_panel, stripe_pair
@@ -73,7 +74,7 @@ def solve_paper(
     UndeterminedError
         If the board's panels are parallel, or fewer than three places at different readings can be used.
     """
-    panel_poses = {name: panel_poses_of(observations, name) for name in observations.corners}
+    panel_poses = {name: board_poses(observations.camera, c, name) for name, c in observations.corners.items()}
     samples: dict[str, UncertainPose] = {}
     angles: list[float] = []
     left_out: list[LeftOut] = []
@@ -101,18 +102,17 @@ def solve_paper(
     return PaperSolution(fitted.motion, panel_poses, samples, fitted.deviations, tuple(left_out))
 
 
-def panel_poses_of(observations: TurntableObservations, placement: str) -> tuple[PanelPose, ...]:
-    """Poses of a placement's panels. Raises UndeterminedError if they have no pose or are parallel."""
-    return board_poses(observations, observations.corners[placement], placement)
+def board_poses(camera: Camera, corners: Sequence[PanelCorners], placement: str = "") -> tuple[PanelPose, ...]:
+    """Poses of a board's panels from their corners (section 1.2).
 
-
-def board_poses(
-    observations: TurntableObservations, corners: tuple[PanelCorners, ...], placement: str
-) -> tuple[PanelPose, ...]:
-    """Poses of a board's panels from their corners (section 1.2)."""
+    Raises
+    ------
+    UndeterminedError
+        If a panel has no pose, or two are parallel; the message names the board's `placement`.
+    """
     where = f" of placement {placement}" if placement else ""
     try:
-        poses = tuple(panel_pose(observations.camera, panel) for panel in corners)
+        poses = tuple(panel_pose(camera, panel) for panel in corners)
     except ValueError as reason:
         raise UndeterminedError(
             f"The panels{where} have no pose in the camera frame: {reason}",

@@ -24,7 +24,7 @@ from lidarpose.model.turntable import TurntableMotion
 
 # Readings closer than this are one and the same place (a thousandth of a degree).
 SAME_READING_RAD = 2e-5
-PAIRS = 60
+PAIRS = 40
 # What a pose is known from splits in two: the light plane, and the two lines within it.
 ACROSS_SCAN_PLANE = [2, 3, 4]
 IN_SCAN_PLANE = [0, 1, 5]
@@ -90,6 +90,8 @@ def fit_by_readings(
     turntable_angles_rad: Sequence[float],
     poses: Sequence[Pose],
     covariances: Sequence[FloatArray] | None = None,
+    *,
+    start: TurntableMotion | None = None,
 ) -> TurntableFunction:
     """The motion that fits the poses best, from the known readings; robust against single bad poses.
 
@@ -103,6 +105,8 @@ def fit_by_readings(
         Of the poses' left perturbations. Only their shape counts: how well the pose is known along its own z and
         in its own x-y plane is rescaled to what the residuals show. Without them translations count alike in all
         directions, and so do rotations.
+    start
+        A motion to start from, where one is known.
 
     Raises
     ------
@@ -113,15 +117,23 @@ def fit_by_readings(
     require_readings(angles)
     R = np.stack([p.rotation for p in poses])
     t = np.stack([p.translation for p in poses])
-    T_w, T_m = _start_from_pairs(angles, R, t)
+    if start is None:
+        T_w, T_m = _start_from_pairs(angles, R, t)
+    else:
+        T_w, T_m = start.T_camera_turntable, start.T_turntable_lidar
     information = _information(poses, covariances, _residuals(angles, R, t, T_w, T_m))
+    floor = LEAST_SCALE if covariances is None else 1.0
     weight: FloatArray = np.ones(len(angles))
-    for _ in range(30):
+    scaled = information
+    for k in range(25):
         previous = weight
-        scaled, weight = _reweigh(_residuals(angles, R, t, T_w, T_m), information)
-        T_w, T_m = _fit_motion(angles, R, t, scaled * weight[:, None, None], T_w, T_m)
-        if np.abs(weight - previous).max() < 1e-4:
+        # Lenient at first: the start rests on two places, and the others lie off it by more than their noise.
+        lenience = max(1.0, 16.0 / 2.0**k)
+        scaled, weight = _reweigh(_residuals(angles, R, t, T_w, T_m), information, floor, lenience)
+        T_w, T_m = _fit_motion(angles, R, t, scaled * weight[:, None, None], T_w, T_m, steps=2)
+        if lenience == 1.0 and np.abs(weight - previous).max() < 1e-3:
             break
+    T_w, T_m = _fit_motion(angles, R, t, scaled * weight[:, None, None], T_w, T_m, steps=10)
     motion = TurntableMotion.from_any_frame(T_w, T_m)
     return TurntableFunction(motion, np.asarray(weight > 0.0), deviations(motion, list(angles), poses))
 
@@ -209,14 +221,14 @@ def motion_axis(R_first: FloatArray, R_second: FloatArray, turn_rad: float) -> F
     return np.asarray(unit(vector if folded >= 0.0 else -vector))
 
 
-def wide_pairs(angles: FloatArray) -> list[tuple[int, int]]:
+def wide_pairs(angles: FloatArray, most: int = PAIRS) -> list[tuple[int, int]]:
     """Pairs of places, those first whose turn shows the axis best, spread over all places."""
     i, j = np.triu_indices(len(angles), 1)
     # Best is a right angle; short turns and nearly whole ones show little, half a turn hides its sense.
     use = np.abs(np.sin(angles[j] - angles[i])) + 0.2 * np.abs(np.sin((angles[j] - angles[i]) / 2.0))
-    order = np.argsort(-use, kind="stable")[: max(PAIRS, len(use) // 4)]
+    order = np.argsort(-use, kind="stable")[: max(most, len(use) // 4)]
     order = order[use[order] > 0.05 * use[order[0]]]
-    chosen = order[:: max(1, len(order) // PAIRS)][:PAIRS]
+    chosen = order[:: max(1, len(order) // most)][:most]
     return [(int(i[k]), int(j[k])) for k in chosen]
 
 
@@ -243,24 +255,26 @@ def _information(poses: Sequence[Pose], covariances: Sequence[FloatArray] | None
     return np.stack(own)
 
 
-def _reweigh(residuals: FloatArray, information: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Information with the scales that the residuals show, and Tukey's weight (N,) of each place."""
+def _reweigh(
+    residuals: FloatArray, information: FloatArray, floor: float, lenience: float
+) -> tuple[FloatArray, FloatArray]:
+    """Information with the scales that the residuals show (`floor` at least), and Tukey's weight (N,) of each place."""
     scale = np.ones(6)
     for block in (ACROSS_SCAN_PLANE, IN_SCAN_PLANE):
         e = residuals[:, block]
         squares = np.einsum("na,nab,nb->n", e, np.linalg.inv(np.linalg.inv(information)[:, block][:, :, block]), e)
         # The median of chi-squared with three degrees of freedom is 2.366.
-        scale[block] = max(np.sqrt(float(np.median(squares)) / 2.366), LEAST_SCALE)
+        scale[block] = max(np.sqrt(float(np.median(squares)) / 2.366), floor)
     scaled = information / np.outer(scale, scale)
     squares = np.einsum("na,nab,nb->n", residuals, scaled, residuals)
-    return scaled, tukey_weights(np.sqrt(squares / 6.0), 3.5)
+    return scaled, tukey_weights(np.sqrt(squares / 6.0) / lenience, 3.5)
 
 
 def _fit_motion(
-    angles: FloatArray, R: FloatArray, t: FloatArray, information: FloatArray, T_w: Pose, T_m: Pose
+    angles: FloatArray, R: FloatArray, t: FloatArray, information: FloatArray, T_w: Pose, T_m: Pose, *, steps: int
 ) -> tuple[Pose, Pose]:
     """Weighted least squares of T_i = T_w @ Rz(angle_i) @ T_m by Gauss-Newton on left perturbations of both factors."""
-    for _ in range(30):
+    for _ in range(steps):
         e = _residuals(angles, R, t, T_w, T_m)
         J = _motion_jacobian(angles, T_w, T_m)
         H = np.einsum("nac,nab,nbd->cd", J, information, J, optimize=True)
@@ -269,7 +283,7 @@ def _fit_motion(
         root = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
         step = root * np.linalg.lstsq(H * np.outer(root, root), g * root, rcond=1e-11)[0]
         T_w, T_m = _stepped(T_w, step[:6]), _stepped(T_m, step[6:])
-        if np.abs(step).max() < 1e-13:
+        if np.abs(step).max() < 1e-12:
             break
     return T_w, T_m
 

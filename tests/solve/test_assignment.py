@@ -1,0 +1,115 @@
+"""Which scan line lies on which panel: right, or refused, never wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lidarpose.errors import InputError, UndeterminedError
+from lidarpose.model.observation import PlaceFeatures, PlaceObservation, ScanLine, TurntableObservations
+from lidarpose.simulate.observations import simulate_observations
+from lidarpose.simulate.rig import FAMILIES, draw_rig
+from lidarpose.solve.assignment import Assignment, assign
+from lidarpose.solve.paper import board_poses, solve_paper
+
+
+def wall(rng: np.random.Generator) -> ScanLine | None:
+    """A straight line somewhere else in the scan."""
+    angle = rng.uniform(-1.5, 1.5) + np.deg2rad(np.arange(0.0, rng.uniform(3.0, 40.0), 0.25))
+    cosine = np.cos(angle - rng.uniform(-3.0, 3.0))
+    seen = cosine > 0.2
+    if seen.sum() < 8:
+        return None
+    ranges = rng.uniform(0.5, 4.0) / cosine[seen] + 1e-3 * rng.normal(size=seen.sum())
+    return ScanLine(angle[seen], ranges, np.full(seen.sum(), 1e-3))
+
+
+def features_of(observations: TurntableObservations, seed: int) -> list[PlaceFeatures]:
+    """What detection would hand over: the lines in any order, among others."""
+    rng = np.random.default_rng(seed)
+    places = []
+    for p in observations.places:
+        lines = [*p.scan_lines.values(), *(w for w in (wall(rng) for _ in range(3)) if w is not None)]
+        shuffled = tuple(lines[k] for k in rng.permutation(len(lines)))
+        places.append(PlaceFeatures(p.position, p.turntable_angle_rad, p.stripes, shuffled, p.placement))
+    return places
+
+
+def assigned(observations: TurntableObservations, seed: int = 0, **options: Any) -> Assignment:
+    poses = {name: board_poses(observations.camera, c, name) for name, c in observations.corners.items()}
+    return assign(observations.camera, poses, features_of(observations, seed), **options)
+
+
+def wrong_places(places: tuple[PlaceObservation, ...], truth: Mapping[str, PlaceObservation]) -> list[str]:
+    return [
+        p.position
+        for p in places
+        if not all(np.array_equal(p.scan_lines[k].angle_rad, truth[p.position].scan_lines[k].angle_rad) for k in (0, 1))
+    ]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_family_of_rigs_is_assigned_rightly(family: Any) -> None:
+    rig = draw_rig(5, family=family, places=None if family == "few-places" else 7)
+    observations = simulate_observations(rig, stripe_step_px=6.0, seed=1)
+    result = assigned(observations)
+    assert wrong_places(result.places, {p.position: p for p in observations.places}) == []
+    assert len(result.left_out) <= 1
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_exact_observations_of_every_family_come_out_exact(family: Any) -> None:
+    rig = draw_rig(5, family=family, places=None if family == "few-places" else 7)
+    observations = simulate_observations(
+        rig, corner_sigma_px=0.0, stripe_sigma_px=0.0, range_sigma_m=0.0, stripe_step_px=6.0
+    )
+    motion = solve_paper(observations).motion
+    for reading in (*rig.turntable_angle_rad, 3.0):
+        metres, radians = motion.pose(reading).distance(rig.motion.pose(reading))
+        assert metres < 1e-6
+        assert radians < 1e-6
+
+
+def test_a_board_that_is_its_own_mirror_image_is_refused_and_the_hint_decides(rig_maker: Callable[..., Any]) -> None:
+    rig = rig_maker(4, places=9, symmetric=True)
+    observations = rig.observe(0, 0.05, 0.1, 1e-3)
+    with pytest.raises(UndeterminedError, match="--first-panel"):
+        assigned(observations)
+    first = observations.places[0].scan_lines
+    smaller = 1 if first[0].angle_rad.mean() < first[1].angle_rad.mean() else 2
+    truth = {p.position: p for p in observations.places}
+    right = assigned(observations, first_panel=smaller)
+    assert "--first-panel" in right.decided_by
+    assert wrong_places(right.places, truth) == []
+    # The other hint gives the mirrored solution: that is what nothing tells apart.
+    other = assigned(observations, first_panel=3 - smaller)
+    assert len(wrong_places(other.places, truth)) == len(other.places)
+
+
+def test_a_hint_against_the_evidence_is_refused(rig_maker: Callable[..., Any]) -> None:
+    observations = rig_maker(4, places=9).observe(0, 0.05, 0.1, 1e-3)
+    first = observations.places[0].scan_lines
+    smaller = 1 if first[0].angle_rad.mean() < first[1].angle_rad.mean() else 2
+    assert len(assigned(observations, first_panel=smaller).places) == 9
+    with pytest.raises(InputError, match="--first-panel"):
+        assigned(observations, first_panel=3 - smaller)
+
+
+def test_places_that_cannot_be_used_are_left_out_with_their_reasons(rig_maker: Callable[..., Any]) -> None:
+    observations = rig_maker(6, places=10).observe(0, 0.05, 0.1, 1e-3)
+    poses = {name: board_poses(observations.camera, c, name) for name, c in observations.corners.items()}
+    places = features_of(observations, 3)
+    places[1] = replace(places[1], stripes={0: places[1].stripes[0]})
+    places[4] = replace(places[4], lines=places[4].lines[:1])
+    places[7] = replace(places[7], turntable_angle_rad=places[7].turntable_angle_rad + 0.1)
+    result = assign(observations.camera, poses, places)
+    assert [item.what for item in result.left_out] == ["position 001", "position 004", "position 007"]
+    assert "stripe on panel 2" in result.left_out[0].reason
+    assert "do not fit the motion" in result.left_out[2].reason
+    assert wrong_places(result.places, {p.position: p for p in observations.places}) == []
+    with pytest.raises(UndeterminedError, match="position 001: no usable stripe on panel 2"):
+        assign(observations.camera, poses, places[:3])
