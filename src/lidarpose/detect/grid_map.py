@@ -49,14 +49,16 @@ class GridMap:
         return np.stack(columns, axis=-1)
 
     def grid(self, pixels: ArrayLike) -> FloatArray:
-        """Grid coordinates (..., 2) of pixels (..., 2): Newton's method from the homography alone."""
+        """Grid coordinates (..., 2) of pixels (..., 2): from the homography, then corrected for the bend.
+
+        The slope stays that of the start (the bend is small); each of the steps gains two digits or more.
+        """
         p = np.asarray(pixels, dtype=np.float64)
-        inverse = np.linalg.inv(self.homography)
-        g = _apply_homography(inverse, p)
-        for _ in range(3):
-            J = self.jacobian(g)
+        g = _apply_homography(np.linalg.inv(self.homography), p)
+        J = self.jacobian(g)
+        det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+        for _ in range(4):
             error = self.pixels(g) - p
-            det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
             step_x = (J[..., 1, 1] * error[..., 0] - J[..., 0, 1] * error[..., 1]) / det
             step_y = (J[..., 0, 0] * error[..., 1] - J[..., 1, 0] * error[..., 0]) / det
             g = g - np.stack([step_x, step_y], axis=-1)
@@ -74,17 +76,17 @@ class GridMap:
     def _terms(self, grid: FloatArray) -> FloatArray:
         half = np.array([max(self.columns - 1, 1), max(self.rows - 1, 1)]) / 2.0
         s, t = np.moveaxis(grid / half - 1.0, -1, 0)
-        return np.stack([s**i * t**j for i, j in _exponents(len(self.bend))], axis=-1)
+        degree = _DEGREES[len(self.bend)]
+        powers_s, powers_t = [np.ones_like(s)], [np.ones_like(t)]
+        for _ in range(degree):
+            powers_s.append(powers_s[-1] * s)
+            powers_t.append(powers_t[-1] * t)
+        terms = [powers_s[i] * powers_t[j] for i in range(degree + 1) for j in range(degree + 1 - i)]
+        return np.stack(terms, axis=-1)
 
 
 # Number of terms of a polynomial in two variables, and its degree.
 _DEGREES = {3: 1, 6: 2, 10: 3, 15: 4, 21: 5}
-
-
-def _exponents(count: int) -> list[tuple[int, int]]:
-    """Exponents of the polynomial's terms: 3 for degree 1, 6 for degree 2, and so on."""
-    degree = _DEGREES[count]
-    return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
 
 
 def grid_points(columns: int, rows: int) -> FloatArray:

@@ -25,7 +25,7 @@ import numpy as np
 from lidarpose.detect.albedo import measure_albedo
 from lidarpose.detect.chessboard import BoardDetection
 from lidarpose.detect.stripe_fit import fit_stripe
-from lidarpose.detect.stripe_search import PanelView, find_line
+from lidarpose.detect.stripe_search import PanelView, find_line, has_line
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.image import GrayImage
 from lidarpose.model.observation import LeftOut, StripePoints
@@ -57,8 +57,8 @@ class StripeFinder:
         self._limit = float(np.iinfo(bright_images[0].dtype).max)
         self._views: list[PanelView] = []
         for grid_map in board.maps:
-            albedo = measure_albedo(grid_map, bright)
-            self._views.append(PanelView.make(albedo, bright))
+            view = PanelView.make(measure_albedo(grid_map, bright), bright)
+            self._views.append(view.with_model() if has_line(view) else view)
 
     def find(self, image: GrayImage) -> StripeDetection:
         """Stripe points on every panel in an image of the same size as the bright ones (ValueError if not)."""

@@ -1,10 +1,13 @@
 """The stripe's centre line to a few hundredths of a pixel, fitted in a narrow band of the raw image.
 
 See `laser_stripe` for the model. Here the image is looked at along a scan coordinate u (x, or y for steep stripes), one
-profile in v for each whole u. Each profile has its own height A, centre c and background; the stripe's width and how
-much light dark squares send back are common to all. Gauss and Newton's method, all profiles at once; the common
-unknowns by the Schur complement. The noise's variance, r^2 + g * level + (s * level)^2 (reading, shots, speckle), is
-learnt from the residuals.
+profile in v for each whole u. Each profile has its own height, centre, background and shift of the squares' edges
+(known to some hundredths of a pixel only: this is what limits points beside an edge); the stripe's width and how much
+light dark squares send back are common to all. Gauss and Newton's method, all profiles at once; the common unknowns by
+elimination of the others. The noise's variance, r^2 + g * level + (s * signal)^2 (reading, shots, speckle), is learnt
+from the residuals.
+
+Arrays are single precision and made once a band: this runs once for each image and panel, in about a millisecond.
 """
 
 from __future__ import annotations
@@ -13,20 +16,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarpose.detect.albedo import PanelAlbedo
 from lidarpose.detect.stripe_search import CoarseLine, PanelView
-from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.robust import mad_sigma, tukey_weights
 from lidarpose.model.image import GrayImage
 from lidarpose.model.observation import StripePoints
 
-# Profiles that are merged into one point: neighbours share the lens's blur and the laser's speckle.
-_BLOCK = 4
+# Profiles that are merged into one point (half as many in short stripes): neighbours share the lens's blur and the
+# laser's speckle.
+_BLOCK = 8
+_SHORT = 300
 _MIN_POINTS = 8
 # Half-height of the band in which the coarse line is made fine, pixels.
 _FIRST_HALF = 12
 # A profile whose own centre is worse than this tells nothing.
 _WORST_SIGMA_PX = 0.8
+# How well the squares' edges are known, pixels; twice, because the profiles of a block share the error.
+_EDGE_SIGMA_PX = 2.0 * 0.03
+# Profiles without light keep to the curve by this pull, nothing against a real profile's hundredths.
+_PULL_PX = 1.5
+# Step of the derivative by the edges' shift, pixels.
+_EDGE_STEP = 0.1
+# Order of the unknowns: the first four are each profile's own, the rest common.
+_BACKGROUND, _HEIGHT, _EDGE, _CENTRE, _WIDTH, _RATIO = range(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,39 +80,49 @@ class _Curve:
 
 @dataclass(frozen=True, eq=False)
 class _Band:
-    """Profiles along the stripe.
+    """Profiles along the stripe, as a table of N profiles of P pixels.
 
-    u : (N,); v : (N, P) pixel coordinates; values, bright : (N, P) grey levels; good : (N, P) pixels that count;
-    ambient : (N, P) light that was taken out of the values.
+    u : (N,); v : (N, P) pixel coordinates; values, bright : grey levels; good : pixels that count;
+    ambient : light that was taken out of the values; cosine, sine : (N,) of the stripe's inclination;
+    light, by_edge : share of light surface that each pixel sees, and its change when the edges move by a pixel.
     """
 
     u: FloatArray
     v: FloatArray
     values: FloatArray
     bright: FloatArray
-    good: BoolArray
+    good: FloatArray
     ambient: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Geometry:
-    """Of each profile, on the curve: cosine and sine of the stripe's inclination (N,), grid coordinates (N, 2) and
-    their gradient (N, 2, 2) by (u, v)."""
-
     cosine: FloatArray
     sine: FloatArray
-    grid: FloatArray
-    gradient: FloatArray
+    light: FloatArray
+    by_edge: FloatArray
+
+    @property
+    def half(self) -> int:
+        return int(self.v.shape[1] // 2)
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
+    """height, centre, background : (N,); information : (N,) on the centre, 1 / px^2 along v."""
+
     height: FloatArray
     centre: FloatArray
     background: FloatArray
     width: float
     dark_ratio: float
     noise: tuple[float, float, float]
+    information: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Smooth:
+    """A smooth curve through the centres, the weight (N,) that each profile is left with, and its residual (N,)."""
+
+    curve: _Curve
+    weight: FloatArray
+    residual: FloatArray
 
 
 def fit_stripe(view: PanelView, image: GrayImage, line: CoarseLine, limit: float) -> StripeFit | str:
@@ -109,26 +131,30 @@ def fit_stripe(view: PanelView, image: GrayImage, line: CoarseLine, limit: float
     u = _usable_range(view, line, straight)
     if len(u) < _MIN_POINTS:
         return "no stripe on the panel: the bright line leaves the squares"
-    band = _cut(view, image, line.steep, u, straight, _FIRST_HALF, limit)
-    first = _first_curve(band, line, straight)
+    first = _first_curve(_cut(view, image, line.steep, u, straight, _FIRST_HALF, limit), line, straight)
     if isinstance(first, str):
         return first
     curve, width = first
-    for _ in range(2):
-        half = int(np.clip(np.ceil(3.5 * width * np.sqrt(1.0 + curve.slope(u) ** 2).max() + 1.5), 4, 24))
-        geometry = _geometry(view.albedo, line.steep, u, curve)
-        cut = _cut(view, image, line.steep, u, curve, half, limit)
-        band, state = _start(cut, geometry, curve, view, width)
-        for _ in range(3):
-            state, information = _step(band, geometry, view.albedo, state, curve)
-        smooth = _smooth(band, geometry, state, information)
-        if isinstance(smooth, str):
-            return smooth
-        curve, weight, residual = smooth
-        if abs(np.log(state.width / width)) < 0.1:
-            break
-        width = state.width
-    return _points(band, geometry, curve, residual, weight, line.steep, state)
+    band = _start_band(view, image, line.steep, u, curve, width, limit)
+    state = _start(band, curve, view, width)
+    band, state, smooth = _refine(band, state, view, line.steep, curve)
+    if isinstance(smooth, str):
+        return smooth
+    if _half_height(smooth.curve, u, state.width) > band.half:
+        band = _start_band(view, image, line.steep, u, smooth.curve, state.width, limit)
+        state = _start(band, smooth.curve, view, state.width)
+    band, state, smooth = _refine(band, state, view, line.steep, smooth.curve)
+    return smooth if isinstance(smooth, str) else _points(band, smooth, line.steep, state)
+
+
+def _refine(
+    band: _Band, state: _State, view: PanelView, steep: bool, curve: _Curve
+) -> tuple[_Band, _State, _Smooth | str]:
+    """Two steps with the albedo as it is seen about the curve, and a smooth curve through what comes out."""
+    band = _look_at_albedo(band, view, steep, curve, state.width)
+    state = _step(band, state, curve, learn=True)
+    state = _step(band, state, curve, learn=False)
+    return band, state, _smooth(band, state)
 
 
 def _usable_range(view: PanelView, line: CoarseLine, curve: _Curve) -> FloatArray:
@@ -144,7 +170,7 @@ def _usable_range(view: PanelView, line: CoarseLine, curve: _Curve) -> FloatArra
     u, v = u[inside], v[inside]
     if len(u) == 0:
         return u
-    grid = view.albedo.grid_map.grid(_pixels(u, v, line.steep))
+    grid, _ = view.grid_and_slopes(_pixels(u, v, line.steep))
     return u[view.albedo.is_usable(grid)]
 
 
@@ -156,21 +182,49 @@ def _cut(
     view: PanelView, image: GrayImage, steep: bool, u: FloatArray, curve: _Curve, half: int, limit: float
 ) -> _Band:
     """Profiles of 2 half + 1 pixels about the curve."""
-    v = np.round(curve.at(u)).astype(int)[:, None] + np.arange(-half, half + 1)
+    v = np.rint(curve.at(u)).astype(np.intp)[:, None] + np.arange(-half, half + 1)
     across = 0 if steep else 1
-    inside = (v >= view.low[across]) & (v < view.high[across])
-    safe = np.clip(v, view.low[across], view.high[across] - 1)
-    along = u.astype(int)[:, None]
+    low, high = view.low[across], view.high[across]
+    safe = np.clip(v, low, high - 1)
+    along = u.astype(np.intp)[:, None]
     rows, columns = (along, safe) if steep else (safe, along)
-    values = image[rows, columns]
+    values = image[rows, columns].astype(np.float32)
     bright = view.bright[rows - view.low[1], columns - view.low[0]]
-    good = inside & (values < 0.98 * limit)
-    return _Band(u, v.astype(float), values.astype(float), bright.astype(float), good, np.zeros(values.shape))
+    good = ((v == safe) & (values < 0.98 * limit)).astype(np.float32)
+    slope = curve.slope(u)
+    cosine = 1.0 / np.sqrt(1.0 + slope**2)
+    nothing = np.zeros_like(values)
+    return _Band(u, v.astype(np.float32), values, bright, good, nothing, cosine, slope * cosine, nothing, nothing)
+
+
+def _half_height(curve: _Curve, u: FloatArray, width: float) -> int:
+    """Half-height of a band that holds the profile and enough of its surroundings."""
+    steepest = float(np.sqrt(1.0 + np.max(np.abs(curve.slope(u))) ** 2))
+    return int(np.clip(np.ceil(3.3 * width * steepest + 1.5), 4, 24))
+
+
+def _start_band(
+    view: PanelView, image: GrayImage, steep: bool, u: FloatArray, curve: _Curve, width: float, limit: float
+) -> _Band:
+    """The band about a good curve, with the ambient light taken out."""
+    band = _cut(view, image, steep, u, curve, _half_height(curve, u, width), limit)
+    flank = band.good * (np.abs(_distance(band, curve.at(u))) > 2.7 * width)
+    ambient = _ambient(band, flank)
+    return replace(band, values=band.values - ambient, ambient=ambient)
+
+
+def _distance(band: _Band, centre: FloatArray) -> FloatArray:
+    """Distance (N, P) of the pixels from the stripe's centre line."""
+    return np.asarray((band.v - _column(centre)) * _column(band.cosine))
+
+
+def _column(values: FloatArray) -> FloatArray:
+    return np.asarray(values, dtype=np.float32)[:, None]
 
 
 def _first_curve(band: _Band, line: CoarseLine, straight: _Curve) -> tuple[_Curve, float] | str:
     """A curve within about a pixel, from the brightest pixel of each profile, and the stripe's rough width."""
-    rest = band.values - line.ambient_share * band.bright
+    rest = band.values - np.float32(line.ambient_share) * band.bright
     rest = rest - np.median(rest, axis=1, keepdims=True)
     smooth = rest.copy()
     smooth[:, 1:-1] = 0.25 * rest[:, :-2] + 0.5 * rest[:, 1:-1] + 0.25 * rest[:, 2:]
@@ -202,142 +256,178 @@ def _fit_curve(u: FloatArray, v: FloatArray, weight: FloatArray, degree: int) ->
     return _Curve(coefficients, middle, half)
 
 
-def _geometry(albedo: PanelAlbedo, steep: bool, u: FloatArray, curve: _Curve) -> _Geometry:
-    slope = curve.slope(u)
-    cosine = 1.0 / np.sqrt(1.0 + slope**2)
-    grid = albedo.grid_map.grid(_pixels(u, curve.at(u), steep))
-    gradient = np.linalg.inv(albedo.grid_map.jacobian(grid))
-    if steep:
-        gradient = gradient[:, :, ::-1]
-    return _Geometry(cosine, slope * cosine, grid, gradient)
-
-
-def _start(band: _Band, geometry: _Geometry, curve: _Curve, view: PanelView, width: float) -> tuple[_Band, _State]:
-    """Take the ambient light out, and guess heights and backgrounds."""
+def _start(band: _Band, curve: _Curve, view: PanelView, width: float) -> _State:
+    """Guess heights and backgrounds."""
     centre = curve.at(band.u)
-    distance = (band.v - centre[:, None]) * geometry.cosine[:, None]
-    flank = band.good & (np.abs(distance) > 3.0 * width)
-    ambient = _ambient(band, flank)
-    rest = band.values - ambient
-    count = np.maximum(flank.sum(axis=1), 1)
-    background = (rest * flank).sum(axis=1) / count
-    core = band.good & (np.abs(distance) < width)
-    height = ((rest - background[:, None]) * core).sum(axis=1) / np.maximum(core.sum(axis=1), 1) / 0.85
-    reading = mad_sigma((rest - background[:, None])[flank]) if flank.any() else 1.0
-    r = float(np.clip(np.median(view.albedo.dark / view.albedo.light), 0.0, 0.95))
-    state = _State(np.maximum(height, 1.0), centre, background, width, r, (max(reading, 0.3) ** 2, 0.0, 0.0))
-    return replace(band, values=rest, ambient=ambient), state
+    distance = np.abs(_distance(band, centre))
+    flank, core = band.good * (distance > 2.7 * width), band.good * (distance < width)
+    background = (band.values * flank).sum(axis=1) / np.maximum(flank.sum(axis=1), 1.0)
+    rest = band.values - background[:, None]
+    height = (rest * core).sum(axis=1) / np.maximum(core.sum(axis=1), 1.0) / 0.85
+    reading = 1.25 * float((np.abs(rest) * flank).sum() / max(float(flank.sum()), 1.0))
+    ratio = float(np.clip(np.median(view.albedo.dark / np.maximum(view.albedo.light, 1.0)), 0.0, 0.95))
+    noise = (max(reading, 0.3) ** 2, 0.0, 0.0)
+    return _State(np.maximum(height, 1.0), centre, background, width, ratio, noise, np.ones(len(centre)))
 
 
-def _ambient(band: _Band, flank: BoolArray) -> FloatArray:
-    """The bright image times a share that changes slowly along the stripe, from the pixels beside it."""
-    count = np.maximum(flank.sum(axis=1, keepdims=True), 1)
-    values, bright = (
-        np.where(flank, x - (x * flank).sum(axis=1, keepdims=True) / count, 0.0) for x in (band.values, band.bright)
-    )
-    s = (band.u - band.u.mean()) / max(np.ptp(band.u) / 2.0, 1.0)
+def _ambient(band: _Band, flank: FloatArray) -> FloatArray:
+    """The bright image times a share that changes slowly along the stripe, from the pixels beside it (`flank`)."""
+    count = np.maximum(flank.sum(axis=1, keepdims=True), 1.0)
+    values, bright = (flank * (x - (x * flank).sum(axis=1, keepdims=True) / count) for x in (band.values, band.bright))
+    s = (band.u - band.u.mean()) / max(float(np.ptp(band.u)) / 2.0, 1.0)
     powers = np.stack([np.ones_like(s), s, s**2], axis=1)
-    own, cross = (bright**2).sum(axis=1), (bright * values).sum(axis=1)
+    own, cross = np.einsum("np,np->n", bright, bright), np.einsum("np,np->n", bright, values)
     normal = (powers * own[:, None]).T @ powers
     # Flat profiles tell nothing: a weak pull towards no ambient light.
     share = np.linalg.solve(normal + np.eye(3) * (1e-6 * np.trace(normal) + 1.0), powers.T @ cross)
-    return np.asarray((powers @ share)[:, None] * band.bright)
+    return np.asarray(_column(powers @ share) * band.bright)
 
 
-def _step(
-    band: _Band, geometry: _Geometry, albedo: PanelAlbedo, state: _State, curve: _Curve
-) -> tuple[_State, FloatArray]:
-    """One Gauss-Newton step; also the information (N,) on each centre, 1 / px^2 along v."""
-    distance = (band.v - state.centre[:, None]) * geometry.cosine[:, None]
-    light, dark = _shares(band, geometry, albedo, state, curve, distance)
-    bell = np.exp(-0.5 * (distance / state.width) ** 2)
-    by_height = bell * (light + state.dark_ratio * dark)
-    signal = state.height[:, None] * by_height
-    residual = band.values - signal - state.background[:, None]
-    level = np.maximum(signal + band.ambient + state.background[:, None], 0.0)
-    r2, g, s2 = state.noise
-    weight = band.good / (r2 + g * level + s2 * signal**2)
-    J = np.stack(
-        [
-            by_height,
-            signal * distance * (geometry.cosine[:, None] / state.width**2),
-            np.ones_like(signal),
-            signal * (distance / state.width) ** 2,
-            state.height[:, None] * bell * dark,
-        ],
-        axis=-1,
+def _look_at_albedo(band: _Band, view: PanelView, steep: bool, curve: _Curve, width: float) -> _Band:
+    """Share of light surface that each pixel sees through stripe and lens (see `laser_stripe`)."""
+    albedo = view.albedo
+    centre = curve.at(band.u)
+    slope = curve.slope(band.u)
+    cosine = 1.0 / np.sqrt(1.0 + slope**2)
+    band = replace(band, cosine=cosine, sine=slope * cosine)
+    grid, slopes = view.grid_and_slopes(_pixels(band.u, centre, steep))
+    by_u, by_v = (slopes[:, 1::2], slopes[:, ::2]) if steep else (slopes[:, ::2], slopes[:, 1::2])
+    across = by_v * _column(cosine) - by_u * _column(band.sine)
+    along = by_u * _column(cosine) + by_v * _column(band.sine)
+    blur2 = min(albedo.blur_px, width) ** 2
+    thickness = 1.0 - blur2 / width**2
+    edges = np.sqrt(blur2 * (thickness * across**2 + along**2))
+    # A pixel at (0, dv) from the centre is seen at dv along the stripe's tangent plus `thickness` of it across.
+    dv = band.v - _column(centre)
+    per_v = by_v * _column(cosine**2 * thickness + band.sine**2) + by_u * _column(
+        (1.0 - thickness) * cosine * band.sine
     )
-    weighted = np.swapaxes(J * weight[..., None], 1, 2)
-    normal = weighted @ J
-    right = (weighted @ residual[..., None])[..., 0]
-    # Profiles without light keep to the curve: a pull of 1.5 px, nothing against a real profile's hundredths.
-    normal[:, 1, 1] += 1.0 / 1.5**2
-    right[:, 1] += (curve.at(band.u) - state.centre) / 1.5**2
-    normal[:, 0, 0] += 1e-9
-    normal[:, 2, 2] += 1e-9
-    inverse = np.linalg.inv(normal[:, :3, :3])
-    mixed = normal[:, :3, 3:]
-    common = (normal[:, 3:, 3:] - np.swapaxes(mixed, 1, 2) @ inverse @ mixed).sum(axis=0) + np.diag([1e-6, 100.0])
-    goal = (right[:, 3:] - (np.swapaxes(mixed, 1, 2) @ inverse @ right[:, :3, None])[..., 0]).sum(axis=0)
-    shared = np.clip(np.linalg.solve(common, goal), [-0.3, -0.1], [0.3, 0.1])
-    own = (inverse @ (right[:, :3] - mixed @ shared)[..., None])[..., 0]
-    moved = _State(
-        np.maximum(state.height + own[:, 0], 1e-3),
-        state.centre + np.clip(own[:, 1], -1.0, 1.0),
-        state.background + own[:, 2],
-        float(np.clip(state.width * np.exp(shared[0]), 0.4, 10.0)),
-        float(np.clip(state.dark_ratio + shared[1], 0.0, 1.0)),
-        _learn_noise(residual[band.good], level[band.good], signal[band.good], state.noise),
-    )
-    return moved, np.asarray(1.0 / inverse[:, 1, 1])
+    inside = _inside_squares(view, grid, slopes, width)
+    shares = []
+    for moved in (-_EDGE_STEP, _EDGE_STEP):
+        x, y = (dv * per_v[:, k, None] + (grid[:, k] - moved * across[:, k])[:, None] for k in (0, 1))
+        shares.append(albedo.light_share(x, y, edges[:, 0, None], edges[:, 1, None]))
+    light, by_edge = 0.5 * (shares[0] + shares[1]), (shares[1] - shares[0]) / np.float32(2.0 * _EDGE_STEP)
+    return replace(band, light=light, by_edge=by_edge, good=band.good * inside[:, None])
 
 
-def _shares(
-    band: _Band, geometry: _Geometry, albedo: PanelAlbedo, state: _State, curve: _Curve, distance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Share (N, P) of light, and of dark, surface that each pixel sees through stripe and lens (see `laser_stripe`)."""
-    blur2 = min(albedo.blur_px, state.width) ** 2
-    thickness = 1.0 - blur2 / state.width**2
-    cosine, sine = geometry.cosine[:, None], geometry.sine[:, None]
-    along_u = (1.0 - thickness) * distance * sine
-    along_v = (band.v - curve.at(band.u)[:, None]) - (1.0 - thickness) * distance * cosine
-    where = []
-    edges = []
+def _inside_squares(view: PanelView, grid: FloatArray, slopes: FloatArray, width: float) -> FloatArray:
+    """1 for profiles (N,) whose light falls on usable squares alone: what lies around the board is not known."""
+    albedo = view.albedo
+    inside = albedo.is_usable(grid)
+    size = (albedo.grid_map.columns, albedo.grid_map.rows)
     for k in (0, 1):
-        g_u, g_v = geometry.gradient[:, k, 0, None], geometry.gradient[:, k, 1, None]
-        where.append(geometry.grid[:, k, None] + g_u * along_u + g_v * along_v)
-        across, along = -g_u * sine + g_v * cosine, g_u * cosine + g_v * sine
-        edges.append(np.sqrt(blur2 * (thickness * across**2 + along**2)))
-    sign = albedo.sign_at(where[0], where[1], edges[0], edges[1])
-    return 0.5 * (1.0 + sign), 0.5 * (1.0 - sign)
+        reach = 2.5 * width * np.hypot(slopes[:, 2 * k], slopes[:, 2 * k + 1])
+        inside &= (grid[:, k] > -1.0 + reach) & (grid[:, k] < size[k] - reach)
+    return inside.astype(np.float32)
+
+
+def _step(band: _Band, state: _State, curve: _Curve, *, learn: bool) -> _State:
+    """One Gauss-Newton step; with `learn`, the noise is learnt again first."""
+    distance = _distance(band, state.centre) * np.float32(1.0 / state.width)
+    squared = distance * distance
+    bell = np.exp(-0.5 * squared)
+    ratio, height = np.float32(state.dark_ratio), _column(state.height)
+    by_height = bell * (ratio + (1 - ratio) * band.light)
+    signal = height * by_height
+    tall = height * bell
+    rest = band.values - _column(state.background)
+    residual = rest - signal
+    level = np.maximum(rest + band.ambient + _column(state.background), 0.0)
+    noise = _learn_noise(residual, level, signal, band.good, state.noise) if learn else state.noise
+    variance = np.float32(noise[0]) + np.float32(noise[1]) * level + np.float32(noise[2]) * signal * signal
+    weight = band.good / variance
+    J = (
+        np.ones_like(signal),
+        by_height,
+        tall * ((1 - ratio) * band.by_edge),
+        signal * distance * _column(band.cosine / state.width),
+        signal * squared,
+        tall * (1 - band.light),
+        residual,
+    )
+    M = _normal_equations(J, weight)
+    M[_BACKGROUND, _BACKGROUND] += 1e-9
+    M[_HEIGHT, _HEIGHT] += 1e-9
+    M[_EDGE, _EDGE] += 1.0 / _EDGE_SIGMA_PX**2
+    M[_CENTRE, _CENTRE] += 1.0 / _PULL_PX**2
+    M[_CENTRE, -1] += (curve.at(band.u) - state.centre) / _PULL_PX**2
+    change, common, information = _solve(M)
+    return _State(
+        np.maximum(state.height + change[_HEIGHT], 1e-3),
+        state.centre + np.clip(change[_CENTRE], -1.0, 1.0),
+        state.background + change[_BACKGROUND],
+        float(np.clip(state.width * np.exp(common[0]), 0.4, 10.0)),
+        float(np.clip(state.dark_ratio + common[1], 0.0, 1.0)),
+        noise,
+        information,
+    )
+
+
+def _normal_equations(J: tuple[FloatArray, ...], weight: FloatArray) -> FloatArray:
+    """Sums (6, 7, N) over each profile of weight * J_i * J_j; the last column belongs to the residual."""
+    M = np.empty((6, 7, len(weight)))
+    for i in range(6):
+        weighted = J[i] * weight
+        for j in range(i, 7):
+            M[i, j] = np.einsum("np,np->n", weighted, J[j])
+            if j < 6:
+                M[j, i] = M[i, j]
+    return M
+
+
+def _solve(M: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Changes (4, N) of the profiles' own unknowns, (2,) of the common ones, and the centres' information (N,).
+
+    Gauss's elimination of each profile's own unknowns, what is left summed over the profiles. `M` is used up.
+    """
+    own = 4
+    for k in range(own):
+        pivot = M[k, k + 1 :] / M[k, k]
+        M[k + 1 :, k + 1 :] -= M[k + 1 :, k, None] * pivot
+    information = M[_CENTRE, _CENTRE]
+    left = M[own:, own:].sum(axis=-1)
+    # Weak pulls to where they are: the ratio (to 0.1) cannot be told where no profile crosses an edge.
+    common = np.linalg.solve(left[:, :2] + np.diag([1e-6, 100.0]), left[:, 2])
+    common = np.clip(common, [-0.3, -0.1], [0.3, 0.1])
+    change = np.empty((own, M.shape[-1]))
+    for k in reversed(range(own)):
+        value = M[k, -1] - M[k, _WIDTH] * common[0] - M[k, _RATIO] * common[1]
+        for j in range(k + 1, own):
+            value = value - M[k, j] * change[j]
+        change[k] = value / M[k, k]
+    return change, common, information
 
 
 def _learn_noise(
-    residual: FloatArray, level: FloatArray, signal: FloatArray, before: tuple[float, float, float]
+    residual: FloatArray, level: FloatArray, signal: FloatArray, good: FloatArray, before: tuple[float, float, float]
 ) -> tuple[float, float, float]:
-    """Variance as r^2 + g * level + s^2 * signal^2 (all >= 0), from the residuals sorted by the signal."""
-    if len(residual) < 200:
-        return before
+    """Variance as r^2 + g * level + s^2 * signal^2 (all >= 0), from residuals sorted into bins by the signal."""
     from scipy.optimize import nnls
 
+    some = np.flatnonzero(good.ravel()[::3]) * 3
+    if len(some) < 100:
+        return before
+    error, level, signal = np.abs(residual.ravel()[some]), level.ravel()[some], signal.ravel()[some]
     order = np.argsort(signal)
-    bins = np.array_split(order, 10)
-    # A quarter of the pixels' freedom went into the fit at most; medians are deaf to what does not belong.
-    variance = np.array([max((1.4826 * np.median(np.abs(residual[b]))) ** 2, 0.05) for b in bins])
-    design = np.array([[1.0, level[b].mean(), (signal[b] ** 2).mean()] for b in bins])
-    solution, _ = nnls(design / variance[:, None], np.ones(len(bins)))
+    rows = []
+    for part in np.array_split(order, 8):
+        # Medians are deaf to what does not belong; a sixth of the freedom went into the fit.
+        variance = 1.2 * (1.4826 * float(np.median(error[part]))) ** 2
+        rows.append((max(variance, 0.05), float(level[part].mean()), float((signal[part] ** 2).mean())))
+    table = np.array(rows)
+    design = np.column_stack([np.ones(len(table)), table[:, 1:]]) / table[:, :1]
+    solution, _ = nnls(design, np.ones(len(table)))
     return (max(float(solution[0]), 0.05), float(solution[1]), float(solution[2]))
 
 
-def _smooth(
-    band: _Band, geometry: _Geometry, state: _State, information: FloatArray
-) -> tuple[_Curve, FloatArray, FloatArray] | str:
-    """A smooth curve through the centres; the weights (N,) that are left, and residuals (N,)."""
-    sigma = 1.0 / np.sqrt(information)
-    weight = np.where(sigma * geometry.cosine < _WORST_SIGMA_PX, information, 0.0)
+def _smooth(band: _Band, state: _State) -> _Smooth | str:
+    """A smooth curve through the centres, robust against the profiles that show something else."""
+    sigma = 1.0 / np.sqrt(state.information)
+    weight = np.where(sigma * band.cosine < _WORST_SIGMA_PX, state.information, 0.0)
     robust = weight
     degree = 3 if np.count_nonzero(weight) > 60 else 2
-    for _ in range(4):
+    for _ in range(3):
         if np.count_nonzero(robust) < _MIN_POINTS:
             return "no stripe on the panel: too few profiles show it"
         curve = _fit_curve(band.u, state.centre, robust, degree)
@@ -346,40 +436,35 @@ def _smooth(
         scale = max(mad_sigma(standardised[weight > 0], centred=True), 1.0)
         robust = weight * tukey_weights(standardised / scale)
     kept = np.where(np.abs(standardised) < 4.0 * scale, weight, 0.0)
-    spread = mad_sigma((residual * geometry.cosine)[kept > 0], centred=True)
-    if spread > 0.5 * max(state.width, 1.0):
+    spread = mad_sigma((residual * band.cosine)[kept > 0], centred=True)
+    if not spread < 0.5 * max(state.width, 1.0):
         return "the bright line on the panel is not the narrow straight line that a laser makes"
-    return curve, kept, residual
+    return _Smooth(curve, kept, residual)
 
 
-def _points(
-    band: _Band,
-    geometry: _Geometry,
-    curve: _Curve,
-    residual: FloatArray,
-    weight: FloatArray,
-    steep: bool,
-    state: _State,
-) -> StripeFit | str:
+def _points(band: _Band, smooth: _Smooth, steep: bool, state: _State) -> StripeFit | str:
     """Merge blocks of neighbouring profiles; their scatter about the curve corrects what the noise model states."""
-    block = np.floor(band.u / _BLOCK).astype(int)
+    weight = smooth.weight
+    length = _BLOCK if np.count_nonzero(weight) > _SHORT else _BLOCK // 2
+    block = np.floor(band.u / length).astype(int)
     block -= block[0]
     total = np.bincount(block, weight)
-    enough = (np.bincount(block, weight > 0) >= _BLOCK // 2) & (total > 0)
-    if enough.sum() < _MIN_POINTS:
-        return "no stripe on the panel: too few profiles show it"
+    enough = (np.bincount(block, weight > 0) >= length // 2) & (total > 0)
     safe = np.where(enough, total, 1.0)
-    mean = [(np.bincount(block, weight * x) / safe)[enough] for x in (band.u, residual, geometry.cosine, geometry.sine)]
-    u, offset, cosine, sine = mean
-    length = np.hypot(cosine, sine)
-    cosine, sine = cosine / length, sine / length
+    columns = (band.u, smooth.residual, band.cosine, band.sine)
+    u, offset, cosine, sine = ((np.bincount(block, weight * x) / safe)[enough] for x in columns)
     sigma = 1.0 / np.sqrt(total[enough])
+    if len(u) < _MIN_POINTS:
+        return "no stripe on the panel: too few profiles show it"
     freedom = np.sqrt(max(len(u) - 4, 1) / len(u))
     inflation = max(mad_sigma(offset / sigma, centred=True) / freedom, 1.0)
-    v = curve.at(u) + offset
-    points = StripePoints(
-        _pixels(u, v, steep),
-        np.stack([cosine, -sine] if steep else [-sine, cosine], axis=-1),
-        sigma * inflation * cosine,
-    )
+    norm = np.hypot(cosine, sine)
+    cosine, sine = cosine / norm, sine / norm
+    sigma = sigma * inflation * cosine
+    # Points on dark squares beside points on light ones: a hundredth of their weight, and mostly trouble.
+    best = np.percentile(sigma, 20)
+    worth = sigma < max(8.0 * best, 0.1)
+    u, offset, cosine, sine, sigma = u[worth], offset[worth], cosine[worth], sine[worth], sigma[worth]
+    normals = np.stack([cosine, -sine] if steep else [-sine, cosine], axis=-1)
+    points = StripePoints(_pixels(u, smooth.curve.at(u) + offset, steep), normals, sigma)
     return StripeFit(points, state.width, state.dark_ratio, inflation)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from lidarpose.detect.albedo import PanelAlbedo
-from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.model.image import GrayImage
 
 # Panels are reduced to about this many pixels across; a stripe keeps most of its height at a quarter of the size.
@@ -16,6 +16,12 @@ _SMALL_SIDE = 180
 _HYPOTHESES = 150
 # A second line with this share of the first one's support makes the choice between them a guess.
 _AMBIGUOUS = 0.5
+# A stripe, saturated or not, is narrower than twice this many reduced pixels.
+_RIDGE_REACH = 4
+# Pixels between the places where grid coordinates are computed; between them they are interpolated (to 0.01 px).
+_NODE_STEP = 8
+# Reduced pixels of each colour that tell the ambient light.
+_LEVEL_SAMPLES = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,13 +33,15 @@ class PanelView:
     low, high : (2,)
         The part: pixels x, y from `low` up to, not including, `high`.
     bright : (height, width) float32
-        The bright image there.
+        The bright image there, or its model where the bright image has a stripe itself.
     factor
         How many pixels of the image one pixel of the reduced one has each way.
     small_bright, small_mask
         The bright image and the usable area, reduced.
-    light, dark
-        Reduced pixels inside light, and dark, squares: they tell the ambient light.
+    light, dark : (M,)
+        Flat indices of some reduced pixels inside light, and dark, squares: they tell the ambient light.
+    nodes : (h, w, 2), slopes : (h, w, 4)
+        Grid coordinates, and their derivatives (x by u, x by v, y by u, y by v), at every eighth pixel from `low`.
     """
 
     albedo: PanelAlbedo
@@ -43,11 +51,13 @@ class PanelView:
     factor: int
     small_bright: FloatArray
     small_mask: BoolArray
-    light: BoolArray
-    dark: BoolArray
+    light: IntArray
+    dark: IntArray
+    nodes: FloatArray
+    slopes: FloatArray
 
     @staticmethod
-    def make(albedo: PanelAlbedo, bright: FloatArray) -> PanelView:
+    def make(albedo: PanelAlbedo, bright: GrayImage | FloatArray) -> PanelView:
         """From the panel's albedo and the whole bright image."""
         outline = albedo.grid_map.outline()
         height, width = bright.shape
@@ -55,14 +65,14 @@ class PanelView:
         high = np.clip(np.ceil(outline.max(axis=0)).astype(int) + 1, 0, [width, height])
         factor = int(np.clip(round(float((high - low).min()) / _SMALL_SIDE), 1, 4))
         high = low + (high - low) // factor * factor
-        part = np.ascontiguousarray(bright[low[1] : high[1], low[0] : high[0]], dtype=np.float32)
+        part = np.array(bright[low[1] : high[1], low[0] : high[0]], dtype=np.float32)
         small = reduce_image(part, factor)
-        y, x = np.indices(small.shape)
-        centres = np.stack([x, y], axis=-1) * factor + (factor - 1) / 2.0 + low
-        grid = _dense_grid(albedo, centres, factor)
+        nodes, slopes = _nodes(albedo, low, high)
+        grid = interpolate(nodes, *_pixel_centres(small.shape, factor))
         inside = albedo.is_usable(grid)
-        away = np.abs(grid - np.round(grid)).min(axis=-1) > 0.2
-        is_light = albedo.sign_at(grid[..., 0], grid[..., 1], np.array(0.01), np.array(0.01)) > 0
+        away = inside & (np.abs(grid - np.round(grid)).min(axis=-1) > 0.2)
+        share = albedo.light_share(grid[..., 0], grid[..., 1], np.array(0.01), np.array(0.01))
+        light, dark = (np.flatnonzero(away & side) for side in (share > 0.5, share <= 0.5))
         return PanelView(
             albedo,
             (int(low[0]), int(low[1])),
@@ -71,12 +81,57 @@ class PanelView:
             factor,
             small,
             inside,
-            inside & away & is_light,
-            inside & away & ~is_light,
+            light[:: max(len(light) // _LEVEL_SAMPLES, 1)],
+            dark[:: max(len(dark) // _LEVEL_SAMPLES, 1)],
+            nodes,
+            slopes,
         )
 
     def crop(self, image: GrayImage) -> GrayImage:
         return image[self.low[1] : self.high[1], self.low[0] : self.high[0]]
+
+    def grid_and_slopes(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Grid coordinates (N, 2) at pixels (N, 2), and their derivatives (N, 4) as in `slopes`."""
+        u, v = (np.asarray(pixels[:, k] - self.low[k], dtype=np.float32)[None] for k in (0, 1))
+        return interpolate(self.nodes, u, v)[0], interpolate(self.slopes, u, v)[0]
+
+    def with_model(self) -> PanelView:
+        """The same with the bright image as squares, levels and blur make it: without what else there is in it."""
+        model = self._model(*_pixel_centres(self.bright.shape, 1), self.albedo.blur_px)
+        return replace(self, bright=model, small_bright=reduce_image(model, self.factor))
+
+    def small_model(self) -> FloatArray:
+        """The modelled bright image, reduced."""
+        f = self.factor
+        blur = float(np.hypot(self.albedo.blur_px, np.sqrt((f * f - 1) / 12.0)))
+        return self._model(*_pixel_centres(self.small_bright.shape, f), blur)
+
+    def _model(self, columns: FloatArray, rows: FloatArray, blur: float) -> FloatArray:
+        grid = interpolate(self.nodes, columns, rows)
+        slopes = interpolate(self.slopes, columns, rows)
+        edges = [blur * np.hypot(slopes[..., k], slopes[..., k + 1]) for k in (0, 2)]
+        share = self.albedo.light_share(grid[..., 0], grid[..., 1], edges[0], edges[1])
+        light, dark = self.albedo.levels(grid)
+        return np.asarray(dark + (light - dark) * share, dtype=np.float32)
+
+
+def _nodes(albedo: PanelAlbedo, low: IntArray, high: IntArray) -> tuple[FloatArray, FloatArray]:
+    y, x = np.mgrid[low[1] : high[1] + _NODE_STEP : _NODE_STEP, low[0] : high[0] + _NODE_STEP : _NODE_STEP]
+    grid = albedo.grid_map.grid(np.stack([x, y], axis=-1))
+    slopes = np.linalg.inv(albedo.grid_map.jacobian(grid)).reshape(*grid.shape[:2], 4)
+    return grid.astype(np.float32), slopes.astype(np.float32)
+
+
+def _pixel_centres(shape: tuple[int, ...], factor: int) -> tuple[FloatArray, FloatArray]:
+    """Columns and rows (float32), in full pixels from the corner, of the pixels of an image reduced by `factor`."""
+    rows, columns = np.indices(shape, dtype=np.float32)
+    return np.asarray(columns * factor + (factor - 1) / 2.0), np.asarray(rows * factor + (factor - 1) / 2.0)
+
+
+def interpolate(nodes: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    """Values (..., channels) of a table of nodes at pixels u, v (...) from its corner; bilinear."""
+    step = np.float32(_NODE_STEP)
+    return np.asarray(cv2.remap(nodes, u / step, v / step, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def reduce_image(image: GrayImage | FloatArray, factor: int) -> FloatArray:
@@ -85,17 +140,6 @@ def reduce_image(image: GrayImage | FloatArray, factor: int) -> FloatArray:
         return np.asarray(image, dtype=np.float32)
     size = (image.shape[1] // factor, image.shape[0] // factor)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-
-
-def _dense_grid(albedo: PanelAlbedo, pixels: FloatArray, factor: int) -> FloatArray:
-    """Grid coordinates of a dense field of pixels, exact on every eighth and interpolated between."""
-    step = max(8 // factor, 1)
-    height, width = pixels.shape[:2]
-    y, x = np.mgrid[0 : height + step : step, 0 : width + step : step]
-    nodes = albedo.grid_map.grid(np.stack([x, y], axis=-1) * factor + pixels[0, 0])
-    rows, columns = (np.asarray(index / step, dtype=np.float32) for index in np.indices((height, width)))
-    channels = [cv2.remap(nodes[..., k].astype(np.float32), columns, rows, cv2.INTER_LINEAR) for k in (0, 1)]
-    return np.stack([np.asarray(channel, dtype=np.float64) for channel in channels], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,21 +172,39 @@ class CoarseLine:
 def find_line(view: PanelView, image: GrayImage) -> CoarseLine | str:
     """The one line of light on the panel, or why there is none, in words."""
     small = reduce_image(view.crop(image), view.factor)
-    ridge, share = _without_ambient(view, small)
-    noise = _noise(ridge, view.small_mask)
-    threshold = max(6.0 * noise, 1.5)
-    first = _best_line(ridge, threshold)
+    return _find_in_reduced(view, small, view.small_bright)
+
+
+def has_line(view: PanelView) -> bool:
+    """Whether the bright image itself has a line of light on the panel: a stripe that must not pass for albedo."""
+    return not isinstance(_find_in_reduced(view, view.small_bright, view.small_model()), str)
+
+
+def _find_in_reduced(view: PanelView, small: FloatArray, template: FloatArray) -> CoarseLine | str:
+    rest, share = _without_ambient(view, small, template)
+    ridges = (_ridge(rest), _ridge(rest.T))
+    threshold = max(6.0 * _noise(view, ridges), 1.5)
+    first = _best_line(ridges, threshold)
     if first is None:
         return "no stripe on the panel: nothing stands out in a line"
     line, support, length = first
-    if length < 0.15 * min(ridge.shape):
+    if length < 0.15 * min(small.shape):
         return "no stripe on the panel: the only bright line is too short"
-    rest = ridge.copy()
-    _erase(rest, line)
-    second = _best_line(rest, max(threshold, 0.3 * line.level))
+    for ridge, steep in zip(ridges, (False, True), strict=True):
+        _erase(ridge, line, steep)
+    second = _best_line(ridges, max(threshold, 0.3 * line.level))
     if second is not None and second[1] > _AMBIGUOUS * support:
         return "two lines of light on the panel, and nothing tells which one is the laser's"
     return _to_image(line, view, share)
+
+
+def _ridge(field: FloatArray) -> FloatArray:
+    """How far each pixel stands out above those `_RIDGE_REACH` above and below it; glare and haze are too wide to."""
+    k = _RIDGE_REACH
+    ridge = np.zeros_like(field)
+    middle = field[k:-k]
+    np.minimum(middle - field[: -2 * k], middle - field[2 * k :], out=ridge[k:-k])
+    return ridge
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,38 +217,44 @@ class _SmallLine:
     level: float
 
 
-def _without_ambient(view: PanelView, small: FloatArray) -> tuple[FloatArray, float]:
-    """What the bright image does not explain, made flat, zero off the panel; and the ambient share."""
-    light, dark = np.median(small[view.light]), np.median(small[view.dark])
-    bright_light, bright_dark = np.median(view.small_bright[view.light]), np.median(view.small_bright[view.dark])
-    share = max(float(light - dark) / max(float(bright_light - bright_dark), 1.0), 0.0)
-    rest = small - share * view.small_bright
-    rest -= float(np.median(rest[view.light | view.dark]))
-    rest = np.where(view.small_mask, rest, 0.0).astype(np.float32)
-    # Glare and haze are wide, the stripe is narrow.
-    return np.asarray(np.where(view.small_mask, rest - cv2.blur(rest, (15, 15)), 0.0)), share
+def _without_ambient(view: PanelView, small: FloatArray, template: FloatArray) -> tuple[FloatArray, float]:
+    """What the bright image (`template`) does not explain, made flat, zero off the panel; and the ambient share."""
+    if len(view.light) == 0 or len(view.dark) == 0:
+        return np.zeros_like(small), 0.0
+    light, dark, bright_light, bright_dark = (
+        float(np.median(field.ravel()[index])) for field in (small, template) for index in (view.light, view.dark)
+    )
+    share = max((light - dark) / max(bright_light - bright_dark, 1.0), 0.0)
+    rest = np.asarray(small - np.float32(share) * template)
+    rest -= np.float32(dark - share * bright_dark)
+    rest *= view.small_mask
+    return rest, share
 
 
-def _noise(ridge: FloatArray, mask: BoolArray) -> float:
-    values = ridge[mask]
-    return float(1.4826 * np.median(np.abs(values[::3]))) if values.size else 0.0
+def _noise(view: PanelView, ridges: tuple[FloatArray, FloatArray]) -> float:
+    """Standard deviation of what stands out by chance, from pixels inside the squares."""
+    inner = np.concatenate([view.light, view.dark])
+    if len(inner) == 0:
+        return 0.0
+    # The smaller of two differences is below zero on average; its spread is what counts.
+    values = ridges[0].ravel()[inner]
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
-def _best_line(ridge: FloatArray, threshold: float) -> tuple[_SmallLine, float, float] | None:
+def _best_line(ridges: tuple[FloatArray, FloatArray], threshold: float) -> tuple[_SmallLine, float, float] | None:
     """Line, its support, and its length in reduced pixels."""
     candidates = []
-    for steep in (False, True):
-        field = ridge.T if steep else ridge
-        peak = np.argmax(field, axis=0)
-        height = field[peak, np.arange(field.shape[1])]
+    for ridge, steep in zip(ridges, (False, True), strict=True):
+        peak = np.argmax(ridge, axis=0)
+        height = ridge[peak, np.arange(ridge.shape[1])]
         strong = height > threshold
         if strong.sum() >= 6:
             x = np.flatnonzero(strong).astype(np.float64)
-            found = _consensus(x, peak[strong].astype(np.float64), height[strong], field.shape[0])
+            found = _consensus(x, peak[strong].astype(np.float64), height[strong], ridge.shape[0])
             if found is not None:
                 slope, intercept, inliers, support = found
                 level = float(np.median(height[strong][inliers]))
-                line = _SmallLine(steep, x[inliers].min(), x[inliers].max(), slope, intercept, level)
+                line = _SmallLine(steep, float(x[inliers].min()), float(x[inliers].max()), slope, intercept, level)
                 candidates.append((line, support, float(inliers.sum())))
     return max(candidates, key=lambda c: c[1]) if candidates else None
 
@@ -222,11 +290,12 @@ def _consensus(
     return float(fit[0]), float(fit[1]), inliers, float(weight[inliers].sum())
 
 
-def _erase(ridge: FloatArray, line: _SmallLine) -> None:
-    field = ridge.T if line.steep else ridge
-    y, x = np.indices(field.shape)
-    # Wide enough for the skirts of a saturated stripe.
-    field[np.abs(line.intercept + line.slope * x - y) <= max(6.0, 0.08 * min(ridge.shape))] = 0.0
+def _erase(ridge: FloatArray, line: _SmallLine, steep: bool) -> None:
+    """Blank the line in a ridge image (transposed if `steep`), wide enough for the skirts of a saturated stripe."""
+    v, u = np.ogrid[: ridge.shape[0], : ridge.shape[1]]
+    x, y = (u, v) if steep == line.steep else (v, u)
+    reach = max(6.0, 0.08 * min(ridge.shape)) * np.sqrt(1.0 + line.slope**2)
+    ridge[np.abs(line.intercept + line.slope * x - y) <= reach] = 0.0
 
 
 def _to_image(line: _SmallLine, view: PanelView, share: float) -> CoarseLine:
