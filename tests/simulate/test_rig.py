@@ -92,3 +92,25 @@ def test_what_is_impossible_is_refused() -> None:
         draw_rig(0, step_deg=float("nan"))
     with pytest.raises(InputError, match="family"):
         draw_rig(0, family="nonsense")  # type: ignore[arg-type]
+
+
+def test_other_boards_and_lenses_are_drawn() -> None:
+    rigs = [draw_rig(seed, family="other-boards", places=5) for seed in range(12)]
+    assert len({rig.panels for rig in rigs}) >= 5
+    assert len({round(rig.margin_m, 4) for rig in rigs}) == len(rigs)
+    cameras = [draw_rig(seed, family="other-lenses", places=5, size=(812, 617)).camera for seed in range(12)]
+    assert {camera.model for camera in cameras} == {"plumb_bob", "rational_polynomial", "equidistant"}
+    assert all((camera.width, camera.height) == (812, 617) for camera in cameras)
+    for camera in cameras:
+        # Every pixel shows something: the lens has an inverse all over the picture.
+        u, v = np.meshgrid(np.linspace(0, 811, 12), np.linspace(0, 616, 12))
+        pixels = np.stack([u, v], -1)
+        np.testing.assert_allclose(camera.project(camera.rays(pixels)), pixels, atol=1e-6)
+
+
+def test_the_command_offers_every_family() -> None:
+    from typing import get_args
+
+    from lidarpose.cli.simulate_turntable import FamilyName
+
+    assert get_args(FamilyName) == FAMILIES

@@ -26,6 +26,8 @@ FamilyName = Literal[
     "fold-vertical",
     "mixed",
     "axis-in-scan-plane",
+    "other-boards",
+    "other-lenses",
 ]
 
 
@@ -71,7 +73,7 @@ def simulate_turntable(
     range_sigma_mm
         Noise along the beam.
     width
-        Of the images, in pixels, with the paper's lens.
+        Of the images, in pixels.
     height
         Likewise.
     placements
@@ -96,7 +98,7 @@ def simulate_turntable(
     from lidarpose.cli.console import out as console
     from lidarpose.cli.console import print_json, progress
     from lidarpose.simulate.lidar import LidarBehaviour
-    from lidarpose.simulate.rig import draw_rig, paper_camera
+    from lidarpose.simulate.rig import draw_rig
     from lidarpose.simulate.session import SimulationOptions, draw_photography, simulate_session
     from lidarpose.storage.session_writer import count_files, write_turntable_session
 
@@ -108,7 +110,7 @@ def simulate_turntable(
         start_deg=start_deg,
         range_sigma_m=1e-3 * range_sigma_mm,
         placements=placements,
-        camera=paper_camera(width, height),
+        size=(width, height),
     )
     photography = draw_photography(seed)
     options = SimulationOptions(

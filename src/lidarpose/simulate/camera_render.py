@@ -8,6 +8,7 @@ sheet) is weighted rightly too. The stripe is drawn from each point's distance t
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -182,13 +183,20 @@ def _bounding_box(camera: Camera, surface: Surface) -> tuple[slice, slice] | Non
     edges = np.concatenate([(1 - share) * outline[k] + share * outline[(k + 1) % 4] for k in range(4)])
     ideal = edges[:, :2] / edges[:, 2:]
     # Far outside the picture a distortion polynomial means nothing: hold points within reach of it.
-    ideal = ideal / np.maximum(1.0, np.abs(ideal).max(axis=1, keepdims=True) / 0.6)
+    ideal = ideal / np.maximum(1.0, np.abs(ideal).max(axis=1, keepdims=True) / _view_reach(camera))
     pixels = camera.project(np.column_stack([ideal, np.ones(len(ideal))]))
     low = np.floor(pixels.min(axis=0)).astype(int) - 3
     high = np.ceil(pixels.max(axis=0)).astype(int) + 4
     rows = slice(max(0, low[1]), min(camera.height, high[1]))
     columns = slice(max(0, low[0]), min(camera.width, high[0]))
     return (rows, columns) if rows.start < rows.stop and columns.start < columns.stop else None
+
+
+@lru_cache(maxsize=8)
+def _view_reach(camera: Camera) -> float:
+    """The largest |x/z| or |y/z| that a pixel shows, and a fifth more."""
+    u, v = np.linspace(0.0, camera.width - 1.0, 33), np.linspace(0.0, camera.height - 1.0, 33)
+    return 1.2 * float(np.nanmax(np.abs(camera.undistort(np.stack(np.meshgrid(u, v), axis=-1)))))
 
 
 def _flat_box(camera: Camera, box: tuple[slice, slice]) -> IntArray:

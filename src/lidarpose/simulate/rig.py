@@ -17,7 +17,7 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray, angle_between, as_float_array, unit
 from lidarpose.geometry.se3 import Pose, exp_so3
-from lidarpose.model.camera import Camera
+from lidarpose.model.camera import Camera, DistortionModel
 from lidarpose.model.scan import LidarSpec
 from lidarpose.model.session import DEFAULT_PLACEMENT
 from lidarpose.model.targets import Panel
@@ -42,12 +42,14 @@ Family = Literal[
     "fold-vertical",
     "mixed",
     "axis-in-scan-plane",
+    "other-boards",
+    "other-lenses",
 ]
 FAMILIES: tuple[Family, ...] = get_args(Family)
 
 PAPER_PLACES = 87
 PAPER_ARC_DEG = 21.5
-PAPER_STEP_DEG = 0.25
+PAPER_MARGIN_M = 0.015
 LMS4000_STEP_RAD = float(np.deg2rad(1.0 / 12.0))
 
 # A stripe is of use if it crosses this much of a panel.
@@ -127,7 +129,7 @@ class TurntableRig:
 
 @dataclass(frozen=True)
 class _Ranges:
-    """Between which bounds a family draws; angles in degrees, lengths in metres."""
+    """Between which bounds a family draws; angles in degrees, lengths in metres. None: the paper's, nothing drawn."""
 
     arc: tuple[float, float] = (PAPER_ARC_DEG, PAPER_ARC_DEG)
     places: tuple[int, int] = (PAPER_PLACES, PAPER_PLACES)
@@ -146,7 +148,40 @@ class _Ranges:
     fields_of_view: tuple[float, ...] = (70.0,)
     beam_steps: tuple[float, ...] = (1.0 / 12.0,)
     forward: tuple[float, float] = (88.0, 92.0)
+    boards: tuple[tuple[Panel, Panel], ...] | None = None
+    margin: tuple[float, float] | None = None
+    lenses: tuple[_Lens, ...] | None = None
+    nearest_camera: float = 0.4
 
+
+@dataclass(frozen=True)
+class _Lens:
+    """A lens before a sensor as wide as the paper's: focal length in pixels, and its distortion."""
+
+    focal_px: float
+    model: DistortionModel
+    distortion: tuple[float, ...]
+
+    def camera(self, width: int, height: int) -> Camera:
+        focal = self.focal_px * width / 1624.0
+        K = np.array([[focal, 0.0, 0.51 * width], [0.0, 1.001 * focal, 0.485 * height], [0.0, 0.0, 1.0]])
+        return Camera(width, height, K, self.model, np.array(self.distortion))
+
+
+_LENSES = (
+    _Lens(1500.0, "plumb_bob", (-0.28, 0.11, 0.0008, -0.0012, -0.02)),
+    _Lens(1900.0, "rational_polynomial", (0.35, -0.2, -0.0006, 0.0004, 0.01, 0.6, -0.1, 0.02)),
+    _Lens(1000.0, "equidistant", (-0.02, 0.006, -0.003, 0.0004)),
+    _Lens(3600.0, "plumb_bob", (0.05, -0.3, 0.0, 0.0)),
+)
+_BOARDS = (
+    (Panel(12, 9, 0.030), Panel(9, 6, 0.040)),
+    (Panel(8, 6, 0.040), Panel(8, 6, 0.040)),
+    (Panel(14, 20, 0.020), Panel(14, 20, 0.020)),
+    (Panel(25, 18, 0.015), Panel(25, 18, 0.015)),
+    (Panel(11, 8, 0.030), Panel(20, 14, 0.020)),
+    (Panel(9, 7, 0.035), Panel(7, 9, 0.035)),
+)
 
 _PAPER = _Ranges()
 _MIXED = _Ranges(
@@ -183,6 +218,16 @@ _FAMILY_RANGES: dict[Family, _Ranges] = {
     "fold-horizontal": replace(_PAPER, fold="horizontal"),
     "fold-vertical": replace(_PAPER, fold="vertical"),
     "mixed": _MIXED,
+    "other-boards": replace(
+        _PAPER,
+        fold="any",
+        arc=(8.0, 14.0),
+        places=(20, 87),
+        boards=_BOARDS,
+        margin=(0.0, 0.03),
+        dihedral=(100.0, 140.0),
+    ),
+    "other-lenses": replace(_PAPER, fold="any", lenses=_LENSES, nearest_camera=0.9),
     "axis-in-scan-plane": replace(_PAPER, scan_plane_to_axis=(0.0, 2.0), distance=(1.0, 1.15)),
 }
 
@@ -210,9 +255,10 @@ def draw_rig(
     start_deg: float | None = None,
     range_sigma_m: float = 0.001,
     placements: int = 1,
+    size: tuple[int, int] = (1624, 1234),
     camera: Camera | None = None,
     panels: tuple[Panel, Panel] | None = None,
-    margin_m: float = 0.015,
+    margin_m: float | None = None,
     dihedral_deg: float | None = None,
 ) -> TurntableRig:
     """A rig of a family, by a seed: the same seed gives the same rig.
@@ -228,6 +274,11 @@ def draw_rig(
         Standard deviation of the ranges.
     placements
         How often the board is put up; every placement is seen from all readings.
+    size
+        Width and height of the images.
+    camera, panels, margin_m
+        Instead of the family's own: the paper's lens, the paper's boards, and a white margin of 15 mm around the
+        squares, unless the family draws them.
     dihedral_deg
         Angle between the panels' faces; about 120 degrees unless given. 180 makes them one plane.
 
@@ -245,12 +296,16 @@ def draw_rig(
     angles = np.deg2rad(_draw_readings_deg(rng, ranges, places, step_deg, start_deg))
     if placements < 1:
         raise InputError("placements", f"found {placements}", expected="at least 1")
-    the_camera, the_panels = camera or paper_camera(), panels or paper_panels()
+    the_camera = camera or _draw_lens(rng, ranges, size)
+    the_panels = panels or _draw_boards(rng, ranges)
+    the_margin = margin_m
+    if the_margin is None:
+        the_margin = PAPER_MARGIN_M if ranges.margin is None else float(rng.uniform(*ranges.margin))
     if not (np.isfinite(range_sigma_m) and range_sigma_m >= 0.0):
         raise InputError("--range-sigma-mm", f"found {1e3 * range_sigma_m:g}", expected="a number of 0 or more")
     arc_deg = float(np.rad2deg(np.ptp(angles)))
     for _ in range(_ATTEMPTS if arc_deg <= _LARGEST_ARC_DEG else 0):
-        rig = _draw_once(rng, ranges, the_camera, the_panels, margin_m, angles, placements)
+        rig = _draw_once(rng, ranges, the_camera, the_panels, the_margin, angles, placements)
         if rig is not None and _is_good(rig):
             return replace(rig, range_sigma_m=range_sigma_m, family=family, seed=seed)
     raise InputError(
@@ -258,6 +313,19 @@ def draw_rig(
         f"found no rig of the family {family!r} whose scan plane stays on both panels over {arc_deg:.1f} degrees",
         expected="a smaller arc (places times step)",
     )
+
+
+def _draw_lens(rng: np.random.Generator, ranges: _Ranges, size: tuple[int, int]) -> Camera:
+    if ranges.lenses is None:
+        return paper_camera(*size)
+    return ranges.lenses[int(rng.integers(len(ranges.lenses)))].camera(*size)
+
+
+def _draw_boards(rng: np.random.Generator, ranges: _Ranges) -> tuple[Panel, Panel]:
+    if ranges.boards is None:
+        return paper_panels()
+    first, second = ranges.boards[int(rng.integers(len(ranges.boards)))]
+    return (first, second) if rng.integers(2) else (second, first)
 
 
 def _draw_readings_deg(
@@ -361,7 +429,7 @@ def _draw_camera(
         T_camera_board = _looking_at(target + distance * direction, target, right, roll).inverse()
         return bool(np.all(camera.contains(camera.project(T_camera_board @ corners))))
 
-    near, far = 0.4, 8.0
+    near, far = ranges.nearest_camera, 8.0
     if not sees_all(far):
         return None
     while far / near > 1.002:

@@ -155,7 +155,8 @@ class _Studio:
     def stripe_scale(self) -> float:
         """What turns the laser's light into levels, so that the stripe shows `stripe_level` on white on average.
 
-        From the geometry in the middle of the session: cosine of incidence over distance at both plates' middles.
+        From the geometry in the middle of the session: cosine of incidence over distance at both plates' middles, and
+        how much lens and pixels widen the stripe there.
         """
         centre = self.rig.T_camera_lidar(len(self.rig) // 2).translation
         light = []
@@ -164,7 +165,9 @@ class _Studio:
             distance = float(np.linalg.norm(towards))
             sheet = self.photography.sheet_sigma_m
             thinned = sheet / (sheet + self.photography.sheet_divergence_rad * distance)
-            light.append(surface.albedo * abs(towards @ surface.normal) / distance**2 * thinned)
+            width_px = self.rig.camera.fx * sheet / float(surface.T_camera_surface.translation[2])
+            widened = width_px / np.sqrt(width_px**2 + self.photography.blur_px**2 + 1.0 / 12.0)
+            light.append(surface.albedo * abs(towards @ surface.normal) / distance**2 * thinned * widened)
         return self.photography.stripe_level / float(np.mean(light))
 
     def board_image(self, shot: int) -> GrayImage:
