@@ -71,7 +71,7 @@ def _document(m: RoundMeasurement) -> dict[str, Any]:
         "plane_beams": m.plane_beams,
         "edge_beams": m.edge_beams,
         "edge_covered": m.covered,
-        "open_share": m.open_share,
+        "threshold_known": m.threshold_known,
     }
 
 
@@ -80,10 +80,10 @@ def _remarks(found: list[RoundMeasurement]) -> list[str]:
     remarks = []
     if best.calibration_sigma_m is None:
         remarks.append("the calibration carries no covariance: sigma_mm holds the edge and the plane alone")
-    if best.open_share > 0.3:
+    if not best.threshold_known:
         remarks.append(
-            "nothing returns from behind part of the edge: a beam is taken to be seen there if at least half of its "
-            "spot is on the material; another detection threshold would change the diameter by up to a spot's width"
+            "no mixed returns and no fading light at the edge: a beam is taken to be seen if at least half of its spot "
+            "is on the material; sigma_mm holds what another threshold would change at a spot of about 2 mm"
         )
     if best.covered < 0.5:
         remarks.append(f"only {100 * best.covered:.0f} % of the edge is free")

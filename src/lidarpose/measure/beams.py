@@ -24,11 +24,14 @@ class Beams:
         Starts, metres, and unit directions.
     range_m : (N, M)
         NaN where there is no return.
+    light : (N, M) or None
+        Intensity, in any unit that is proportional to the light.
     """
 
     origin: FloatArray
     direction: FloatArray
     range_m: FloatArray
+    light: FloatArray | None = None
 
     @property
     def points(self) -> FloatArray:
@@ -42,6 +45,7 @@ class Beams:
             np.asarray(self.origin).reshape(-1, 3)[flat],
             self.direction.reshape(-1, 3)[flat],
             self.range_m.reshape(-1)[flat],
+            None if self.light is None else self.light.reshape(-1)[flat],
         )
 
 
@@ -51,7 +55,8 @@ def beams_of(recording: SweepRecording, motion: TurntableMotion) -> Beams:
     if origin.ndim == 2:
         origin = np.broadcast_to(origin[:, None], direction.shape)
     r = np.asarray(recording.range_m, dtype=np.float64)
-    return Beams(origin, direction, np.where(recording.has_return(), r, np.nan))
+    light = None if recording.intensity is None else np.asarray(recording.intensity, dtype=np.float64)
+    return Beams(origin, direction, np.where(recording.has_return(), r, np.nan), light)
 
 
 def chosen_beams(

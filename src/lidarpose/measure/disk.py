@@ -13,8 +13,18 @@ from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.circles import Circle2
 from lidarpose.geometry.planes import Plane
 from lidarpose.measure.beams import Beams, fit_plane_to_ranges, moved_plane, plane_frame, plane_ranges
-from lidarpose.measure.edge_model import EdgeBeams, EdgeFit, fit_edge
-from lidarpose.measure.outline import Kind, RoundOutline, border, find_circle, grid_step, in_plane, judge
+from lidarpose.measure.edge_model import EdgeBeams, EdgeFit, fit_edge, tells_threshold
+from lidarpose.measure.outline import (
+    LEAST_GAP,
+    Kind,
+    RoundOutline,
+    border,
+    find_circle,
+    grid_step,
+    in_plane,
+    judge,
+    without_pinholes,
+)
 from lidarpose.measure.patches import Patch, find_patches
 
 # Beams within this of the edge may have a spot on both sides, whatever the distance between beams.
@@ -45,7 +55,10 @@ class RoundMeasurement:
     plane_rms_m
         Residuals of the ranges to the plane.
     open_share
-        Share of the edge beams with nothing behind the edge.
+        Share of the edge beams of which only hit or miss is known.
+    threshold_known
+        False if nothing tells which part of a spot must be on the material to be seen; the standard deviation then
+        holds what that may make.
     support
         What is needed to see how the calibration moves the answer.
     """
@@ -64,6 +77,7 @@ class RoundMeasurement:
     plane_beams: int
     plane_rms_m: float
     open_share: float
+    threshold_known: bool
     support: EdgeSupport
 
     @property
@@ -117,9 +131,10 @@ def _outlines(beams: Beams, patch: Patch, kind: Kind, seed: int) -> list[RoundOu
     distance = plane_ranges(patch.plane, box)
     place = in_plane(box.origin + distance[..., None] * box.direction, patch.plane, frame)
     step = grid_step(place, patch.mask)
-    beyond = ~patch.mask & ~(box.range_m < distance)
+    with np.errstate(invalid="ignore"):
+        beyond = ~patch.mask & ~(box.range_m < distance)
     flat = np.isfinite(place).all(axis=-1)
-    edges = [border(patch.mask)] if kind == "disk" else _cavity_borders(patch.mask)
+    edges = [border(without_pinholes(patch.mask))] if kind == "disk" else _cavity_borders(patch.mask)
     outlines = []
     for edge_mask in edges:
         edge = place[edge_mask & flat]
@@ -127,7 +142,8 @@ def _outlines(beams: Beams, patch: Patch, kind: Kind, seed: int) -> list[RoundOu
         circle = find_circle(edge, 0.75 * step, smallest=3.0 * step, largest=0.75 * extent, seed=seed)
         if circle is None:
             continue
-        outline = judge(circle, edge, place[flat], patch.mask[flat], beyond[flat], step)
+        none = ~np.isfinite(box.range_m)
+        outline = judge(circle, edge, place[flat], patch.mask[flat], beyond[flat], none[flat], step)
         if outline is not None and outline.kind == kind:
             outlines.append(outline)
     return outlines
@@ -138,13 +154,14 @@ def _cavity_borders(mask: BoolArray) -> list[BoolArray]:
     labels, count = ndimage.label(~mask)
     outside = set(np.unique(np.r_[labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    cavities = [k for k in range(1, count + 1) if k not in outside and sizes[k] >= 9]
+    cavities = [k for k in range(1, count + 1) if k not in outside and sizes[k] >= LEAST_GAP]
     return [ndimage.binary_dilation(labels == k) & mask for k in cavities]
 
 
 def _box(beams: Beams, patch: Patch) -> Beams:
     part = patch.rows, patch.columns
-    return Beams(beams.origin[part], beams.direction[part], beams.range_m[part])
+    light = None if beams.light is None else beams.light[part]
+    return Beams(beams.origin[part], beams.direction[part], beams.range_m[part], light)
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,16 +268,54 @@ def _edge_beams(view: _View, circle: Circle2, kind: Kind, sigma: float) -> tuple
     kept, open_, depth, depth_sigma = _backgrounds(view, reference, near, noise)
     if np.count_nonzero(kept) < 20:
         return None
-    near = near[kept]
-    axes = view.frame[1:]
-    edge = EdgeBeams(
-        view.place[near],
-        view.beams.direction[near] @ axes.T,
-        depth[kept],
-        depth_sigma[kept],
-        open_[kept],
-    )
+    near, slope = near[kept], view.beams.direction[near[kept]] @ view.frame[1:].T
+    light, light_sigma = _light(view, inner, near)
+    light = None if light is None else np.where(open_[kept], light, np.nan)
+    edge = EdgeBeams(view.place[near], slope, depth[kept], depth_sigma[kept], open_[kept], light, light_sigma)
+    if not _mixes(edge, s[near], view.step, dropout):
+        near, edge = _hits_and_misses(near, edge)
     return near, edge, dropout
+
+
+def _mixes(edge: EdgeBeams, s: FloatArray, step: float, dropout: float) -> bool:
+    """True if spots on two surfaces are seen to give what neither gives alone: ranges between, or no return.
+
+    Where none is seen among all beams that cross the edge, the instrument decides for one surface by a threshold that
+    the data do not tell.
+    """
+    near = ~edge.open & (np.abs(s) < 1.5 * step + 0.5 * _WIDEST_SPOT_M)
+    # Only where a range between can be told from both.
+    clear = near & (edge.depth_sigma.max(axis=1) < 1.0 / 15.0)
+    if np.count_nonzero(clear) < 0.5 * np.count_nonzero(near):
+        return True
+    depth, sigma = edge.depth[clear], edge.depth_sigma[clear]
+    between = (depth > 5.0 * sigma[:, 0]) & (depth < 1.0 - 5.0 * sigma[:, 1])
+    lost = float(np.mean(~np.isfinite(depth))) if depth.size else 0.0
+    return int(np.count_nonzero(between)) > max(1, depth.size // 200) or lost > 2.0 * dropout + 0.02
+
+
+def _hits_and_misses(near: IntArray, edge: EdgeBeams) -> tuple[IntArray, EdgeBeams]:
+    """Beams of an instrument that never mixes: on the material or not."""
+    known = edge.open | np.isfinite(edge.depth)
+    depth = np.where(edge.depth < 0.5, 0.0, np.nan)
+    return near[known], replace(edge, depth=depth, open=np.ones(len(edge), dtype=bool)).at(known)
+
+
+def _light(view: _View, inner: BoolArray, near: IntArray) -> tuple[FloatArray | None, float]:
+    """Light of beams relative to the material's, and its noise; None where it does not fall towards the edge."""
+    if view.beams.light is None:
+        return None, 1.0
+    material = view.beams.light[inner & view.on]
+    if len(material) < 20:
+        return None, 1.0
+    full = float(np.median(material))
+    spread = 1.4826 * float(np.median(np.abs(material - full)))
+    if not (full > 0.0 and spread < 0.15 * full):
+        return None, 1.0
+    light, sigma = view.beams.light[near] / full, max(spread / full, 1e-3)
+    hit = np.isfinite(view.excess[near]) & view.on[near]
+    faint = hit & (light < 1.0 - max(5.0 * sigma, 0.1))
+    return (light, sigma) if np.count_nonzero(faint) >= 5 else (None, 1.0)
 
 
 def _backgrounds(
@@ -326,6 +381,7 @@ def _result(view: _View, outline: RoundOutline, near: IntArray, edge: EdgeBeams,
         len(view.plane_used),
         view.plane_rms,
         float(edge.open.mean()),
+        tells_threshold(edge),
         support,
     )
     return replace(draft, plane_sigma_m=_plane_sigma(view, near, support))

@@ -19,7 +19,7 @@ edge), which has no smooth maximum, and whose middle and width are what is wante
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import ndtr
@@ -30,6 +30,10 @@ from lidarpose.geometry.arrays import BoolArray, FloatArray
 SMALLEST_SPOT_M, LARGEST_SPOT_M = 4e-5, 1e-2
 _SMALLEST_SCATTER, _LARGEST_SCATTER = 1e-5, 2.0
 _OUTLIERS = 0.01
+# Softness of the edge of what is detected, in distances between beams.
+_SOFTNESS = 0.02
+# The prior of the spot: its median as a standard deviation (2 mm across), and its spread as a logarithm.
+_USUAL_SPOT_M, _SPOT_SPREAD = 5e-4, 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +51,12 @@ class EdgeBeams:
     depth_sigma : (n, 2)
         Its noise on the material and on the background.
     open : (n,)
-        True where nothing behind the edge returns.
+        True where only a hit or a miss is known: nothing behind the edge returns, or the instrument never mixes.
+        There a depth of 0 is a hit.
+    light : (n,) or None
+        Light of the open hits, relative to that of a spot wholly on the material; None where it tells nothing.
+    light_sigma
+        Its noise.
     """
 
     place: FloatArray
@@ -55,13 +64,23 @@ class EdgeBeams:
     depth: FloatArray
     depth_sigma: FloatArray
     open: BoolArray
+    light: FloatArray | None = None
+    light_sigma: float = 1.0
 
     def __len__(self) -> int:
         return len(self.place)
 
     def at(self, mask: BoolArray) -> EdgeBeams:
         """Some of the beams."""
-        return EdgeBeams(self.place[mask], self.slope[mask], self.depth[mask], self.depth_sigma[mask], self.open[mask])
+        return replace(
+            self,
+            place=self.place[mask],
+            slope=self.slope[mask],
+            depth=self.depth[mask],
+            depth_sigma=self.depth_sigma[mask],
+            open=self.open[mask],
+            light=None if self.light is None else self.light[mask],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +133,12 @@ class _Sorted:
     near_variance: FloatArray
     far_variance: FloatArray
     ends: tuple[int, int, int]
+    light: FloatArray | None
+    light_sigma: float
+    softness: float
 
 
-def _sorted(beams: EdgeBeams, centre: FloatArray) -> _Sorted:
+def _sorted(beams: EdgeBeams, centre: FloatArray, reach: float) -> _Sorted:
     has_return = np.isfinite(beams.depth)
     group = 2 * beams.open.astype(int) + (~has_return).astype(int)
     order = np.argsort(group, kind="stable")
@@ -131,11 +153,14 @@ def _sorted(beams: EdgeBeams, centre: FloatArray) -> _Sorted:
         beams.depth_sigma[kept, 0] ** 2,
         beams.depth_sigma[kept, 1] ** 2,
         (int(bounds[0]), int(bounds[1]), int(bounds[2])),
+        None if beams.light is None else beams.light[order[bounds[1] : bounds[2]]],
+        beams.light_sigma,
+        _SOFTNESS * reach,
     )
 
 
 def _log_likelihood(x: FloatArray, data: _Sorted, inside: bool, dropout: float) -> FloatArray:
-    """Log-likelihood (k,) of parameters (k, 6): centre x, y, radius, log spot, log scatter, share lost."""
+    """Log-likelihood (k,) of parameters (k, 7): centre x, y, radius, log spot, log scatter, lost, threshold."""
     radius, spot = x[:, 2, None], np.exp(x[:, 3, None])
     scatter, lost = np.exp(x[:, 4, None]), x[:, 5, None]
     s = np.hypot(data.place[:, 0] - x[:, 0, None], data.place[:, 1] - x[:, 1, None]) - radius
@@ -154,9 +179,21 @@ def _log_likelihood(x: FloatArray, data: _Sorted, inside: bool, dropout: float) 
         none = F[:, a:b]
         total += np.log(dropout + (1.0 - dropout) * lost * 4.0 * none * (1.0 - none) + 1e-9).sum(axis=1)
     if len(data.place) > b:
-        seen = (1.0 - dropout) * F[:, b:] * (1.0 - 2.0 * _OUTLIERS) + _OUTLIERS
+        # Seen where the share passes an unknown threshold: a sharp edge, displaced by a part of the spot.
+        past = (s[:, b:] + x[:, 6, None] * spot * data.stretch[b:]) / data.softness
+        seen = (1.0 - dropout) * ndtr(-past if inside else past) * (1.0 - 2.0 * _OUTLIERS) + _OUTLIERS
         total += np.log(seen[:, : c - b]).sum(axis=1) + np.log1p(-seen[:, c - b :]).sum(axis=1)
+        if data.light is not None:
+            total += _log_light(data.light, F[:, b:c], scatter, data.light_sigma).sum(axis=1)
     return np.asarray(total)
+
+
+def _log_light(light: FloatArray, share: FloatArray, scatter: FloatArray, sigma: float) -> FloatArray:
+    """Log-density (k, n) of the light of hits, which is the share of the spot on the material."""
+    variance = sigma**2 + scatter * share * (1.0 - share)
+    normal = np.exp(-0.5 * (light - share) ** 2 / variance) / np.sqrt(2.0 * np.pi * variance)
+    known = np.log((1.0 - _OUTLIERS) * normal + _OUTLIERS / 1.5)
+    return np.where(np.isfinite(light), known, 0.0)
 
 
 def fit_edge(
@@ -179,18 +216,20 @@ def fit_edge(
         How far the first estimate may be off, metres; also about the distance between beams.
     """
 
-    log_posterior = _posterior(beams, centre, radius, inside, dropout)
+    log_posterior = _posterior(beams, centre, radius, inside, dropout, reach)
     rng = np.random.default_rng(seed)
     walkers = _anneal(log_posterior, _start(centre, radius, reach, rng), rng)
     # Beams far from the edge, in widths of the spot, say nothing more.
     spot = float(np.exp(walkers[:, 3].max()))
     s, stretch = signed_distance(beams, walkers[:, :2].mean(axis=0), float(walkers[:, 2].mean()))
-    log_posterior = _posterior(
-        beams.at(np.abs(s) < 6.0 * spot * stretch + 1.5 * reach), centre, radius, inside, dropout
-    )
+    near = beams.at(np.abs(s) < 6.0 * spot * stretch + 1.5 * reach)
+    log_posterior = _posterior(near, centre, radius, inside, dropout, reach)
     samples = _sample(log_posterior, walkers, rng)
     mean = samples[:, :3].mean(axis=0)
     covariance = np.cov(samples[:, :3].T)
+    if not tells_threshold(beams):
+        # Sampling a ridge that the prior alone bounds is slow; its variance is known: that of threshold times spot.
+        covariance[2, 2] += _USUAL_SPOT_M**2 * np.exp(2.0 * _SPOT_SPREAD**2) * float(np.mean(stretch**2))
     spot, scatter = np.exp(np.median(samples[:, 3:5], axis=0))
     return EdgeFit(mean[:2], float(mean[2]), covariance, float(spot), float(scatter), float(np.median(samples[:, 5])))
 
@@ -198,9 +237,21 @@ def fit_edge(
 LogDensity = Callable[[FloatArray], FloatArray]
 
 
-def _posterior(beams: EdgeBeams, centre: FloatArray, radius: float, inside: bool, dropout: float) -> LogDensity:
-    """Log posterior density (k,) of parameters (k, 6), up to a constant; the prior is even within bounds."""
-    data = _sorted(beams, centre)
+def tells_threshold(beams: EdgeBeams) -> bool:
+    """True if anything tells where the threshold of detection lies in the spot: mixed ranges, or the light of hits."""
+    return bool(np.any(~beams.open)) or beams.light is not None
+
+
+def _posterior(
+    beams: EdgeBeams, centre: FloatArray, radius: float, inside: bool, dropout: float, reach: float
+) -> LogDensity:
+    """Log posterior density (k,) of parameters (k, 7), up to a constant.
+
+    The prior is even within bounds; for the spot it prefers, weakly, what 2D LiDARs have at a few metres, and for the
+    threshold of detection one half. Both matter only where the data say nothing of them.
+    """
+    data = _sorted(beams, centre, reach)
+    threshold_sigma = 1.0 if tells_threshold(beams) else 1e-3
     low = np.log([SMALLEST_SPOT_M, _SMALLEST_SCATTER])
     high = np.log([LARGEST_SPOT_M, _LARGEST_SCATTER])
 
@@ -209,7 +260,9 @@ def _posterior(beams: EdgeBeams, centre: FloatArray, radius: float, inside: bool
         ok &= np.abs(x[:, 2] - radius) < 0.5 * radius
         value = np.full(len(x), -np.inf)
         if ok.any():
-            value[ok] = _log_likelihood(x[ok], data, inside, dropout)
+            prior = -0.5 * ((x[ok, 3] - np.log(_USUAL_SPOT_M)) / _SPOT_SPREAD) ** 2
+            prior -= 0.5 * (x[ok, 6] / threshold_sigma) ** 2
+            value[ok] = _log_likelihood(x[ok], data, inside, dropout) + prior
         return value
 
     return density
@@ -222,11 +275,10 @@ _STEPS = 200
 
 
 def _start(centre: FloatArray, radius: float, reach: float, rng: np.random.Generator) -> FloatArray:
-    """Walkers (k, 6) spread over what the first estimate leaves open."""
-    middle = np.array([centre[0], centre[1], radius, np.log(0.4 * reach), np.log(0.03), 0.3])
-    walkers = middle + np.array([0.3 * reach, 0.3 * reach, 0.3 * reach, 0.5, 1.5, 0.15]) * rng.normal(
-        size=(_WALKERS, 6)
-    )
+    """Walkers (k, 7) spread over what the first estimate leaves open."""
+    middle = np.array([centre[0], centre[1], radius, np.log(0.4 * reach), np.log(0.03), 0.3, 0.0])
+    spread = np.array([0.3 * reach, 0.3 * reach, 0.3 * reach, 0.5, 1.5, 0.15, 0.5])
+    walkers = middle + spread * rng.normal(size=(_WALKERS, 7))
     walkers[:, 5] = np.clip(walkers[:, 5], 0.01, 0.99)
     walkers[:, 3] = np.clip(walkers[:, 3], np.log(1.2 * SMALLEST_SPOT_M), np.log(0.8 * LARGEST_SPOT_M))
     walkers[:, 4] = np.clip(walkers[:, 4], np.log(2.0 * _SMALLEST_SCATTER), np.log(0.8 * _LARGEST_SCATTER))
@@ -242,7 +294,7 @@ def _anneal(log_density: LogDensity, walkers: FloatArray, rng: np.random.Generat
 
 
 def _sample(log_density: LogDensity, walkers: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Samples (n, 6) of the posterior."""
+    """Samples (n, 7) of the posterior."""
     value = log_density(walkers)
     kept = []
     for step in range(_SETTLE + _STEPS):

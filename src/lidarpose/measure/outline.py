@@ -15,6 +15,8 @@ from lidarpose.geometry.planes import Plane
 
 Kind = Literal["disk", "hole"]
 
+LEAST_GAP = 9
+"""Gaps in a patch of fewer beams than this are no holes."""
 _SECTORS = 36
 _LEAST_COVERED = 0.3
 
@@ -36,6 +38,14 @@ class RoundOutline:
     kind: Kind
     circle: Circle2
     covered: float
+
+
+def without_pinholes(mask: BoolArray) -> BoolArray:
+    """A mask with gaps of fewer than `LEAST_GAP` beams filled: lost returns and outliers."""
+    labels, count = ndimage.label(~mask)
+    small = np.bincount(labels.ravel(), minlength=count + 1) < LEAST_GAP
+    small[0] = False
+    return np.asarray(mask | small[labels])
 
 
 def border(mask: BoolArray) -> BoolArray:
@@ -100,7 +110,13 @@ def _through_three(triples: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def judge(
-    circle: Circle2, edge: FloatArray, place: FloatArray, on: BoolArray, beyond: BoolArray, step: float
+    circle: Circle2,
+    edge: FloatArray,
+    place: FloatArray,
+    on: BoolArray,
+    beyond: BoolArray,
+    none: BoolArray,
+    step: float,
 ) -> RoundOutline | None:
     """What a circle bounds, or None if it is no outline of material.
 
@@ -110,8 +126,8 @@ def judge(
         Border points.
     place : (k, 2)
         Where all beams of the box meet the plane.
-    on, beyond : (k,)
-        Beams that end on the plane, and beams that pass it (a longer range or no return).
+    on, beyond, none : (k,)
+        Beams that end on the plane, beams that pass it (a longer range or no return), beams without return.
     """
     s = circle.distance(place)
     inner, outer = (s < -1.5 * step) & (s > -0.9 * circle.radius - 1.5 * step), (s > 1.5 * step) & (s < 5.0 * step)
@@ -121,7 +137,10 @@ def judge(
     covered = len(np.unique(sectors)) / _SECTORS
     if covered < _LEAST_COVERED:
         return None
-    if on[inner].mean() > 0.75 and on[outer].mean() < 0.5 and beyond[outer].mean() > 0.3:
+    # What stands before a disk may hide some of it; nothing may be seen through it.
+    seen = on | (beyond & ~none)
+    solid = on[inner].mean() > 0.4 and on[inner & seen].mean() > 0.9
+    if solid and on[outer].mean() < 0.5 and beyond[outer].mean() > 0.3:
         return RoundOutline("disk", circle, covered)
     if on[outer].mean() > 0.6 and on[inner].mean() < 0.1 and beyond[inner].mean() > 0.8:
         return RoundOutline("hole", circle, covered)

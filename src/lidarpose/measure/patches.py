@@ -77,9 +77,14 @@ def _flat_windows(points: FloatArray, sigma: float) -> IntArray:
     rms: list[FloatArray] = []
     for i in np.array_split(rows, max(1, len(rows) * len(columns) // 20000)):
         x = np.asarray(windows[i - half][:, columns - half]).reshape(len(i), len(columns), 3, -1)
-        full = np.isfinite(x).all(axis=(2, 3))
-        x = x[full] - x[full].mean(axis=-1, keepdims=True)
-        values = np.linalg.eigvalsh(x @ np.swapaxes(x, -1, -2) / x.shape[-1])
+        seen = np.isfinite(x[:, :, 0])
+        # Beams without return are left out of a window; three quarters of it must be there.
+        full = seen.mean(axis=-1) > 0.75
+        x, seen = x[full], seen[full]
+        count = seen.sum(axis=-1)
+        x = np.where(seen[:, None], x, 0.0)
+        x = np.where(seen[:, None], x - (x.sum(axis=-1) / count[:, None])[..., None], 0.0)
+        values = np.linalg.eigvalsh(x @ np.swapaxes(x, -1, -2) / count[:, None, None])
         spread = np.sqrt(np.maximum(values[:, 0], 0.0))
         where = np.stack(np.meshgrid(i, columns, indexing="ij"), -1)[full]
         flat = spread < 1.5 * sigma
@@ -94,6 +99,7 @@ def _grow(points: FloatArray, i: int, j: int, tolerance: float) -> Patch | None:
     N, M = points.shape[:2]
     half = _WINDOW // 2
     seed = points[i - half : i + half + 1, j - half : j + half + 1].reshape(-1, 3)
+    seed = seed[np.isfinite(seed[:, 0])]
     plane = fit_plane(seed)
     reach = _WINDOW
     count = 0
