@@ -1,0 +1,424 @@
+"""One estimate of the LiDAR's pose from all returns of a three-faced target at all its places.
+
+Model. At place i the target's corner has the measured world coordinates w_i, up to their own noise e_i; in the LiDAR's
+frame it is at ``c_i = R^T (w_i + e_i - t) / s``. The target is not turned, so its three faces have the same normals
+n_j at every place. A beam with direction u meets face j at the range ``n_j . c_i / (n_j . u)``; measured ranges scatter
+about it with the instrument's noise, along the beam. Unknown are the pose (6), three free unit normals (6), the scale
+if asked for, and the e_i, held by their prior. Directions carry no noise, so the residual is one range, and the
+estimate is maximum likelihood but for a redescending loss against what is no return of the faces.
+
+A return enters through three numbers of its face at its place, the plane's shift along its normal and its two tilts.
+Each face at each place therefore collapses to a 3x3 system, and the whole estimate costs one pass over the returns for
+each step, however many frames there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lidarpose.errors import UndeterminedError
+from lidarpose.geometry.arrays import BoolArray, FloatArray, perpendicular_pair, unit
+from lidarpose.geometry.robust import mad_sigma
+from lidarpose.geometry.se3 import Pose, exp_so3, skew
+from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
+
+# Tukey's biweight at 6 sigma keeps 98.8 % efficiency; what is no return of a face is tens of sigmas off.
+TUKEY_K = 6.0
+MIN_SIGMA_M = 1e-6
+MAX_STEPS = 50
+MIN_RETURNS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class FaceSystem:
+    """One face at one place, collapsed: normal equations of (shift, tilt, tilt), in units of the range noise.
+
+    Attributes
+    ----------
+    information : (3, 3)
+        Of the plane's shift at the corner along its normal (m) and of its two tilts about the corner (rad).
+    gradient : (3,)
+        Pull of the residuals on these three.
+    returns
+        How many returns carry weight.
+    """
+
+    information: FloatArray
+    gradient: FloatArray
+    returns: float
+
+
+@dataclass(frozen=True, eq=False)
+class CornerState:
+    """The unknowns: T_world_lidar, normals (3, 3) in the LiDAR frame, scale, and the world coordinates' errors (P, 3)."""
+
+    T_world_lidar: Pose
+    normals: FloatArray
+    scale: float
+    world_errors: FloatArray
+
+    def corners(self, world: FloatArray) -> FloatArray:
+        """The corners (P, 3) in the LiDAR frame."""
+        return np.asarray(self.T_world_lidar.inverse() @ (world + self.world_errors)) / self.scale
+
+
+@dataclass(frozen=True, eq=False)
+class CornerFit:
+    """The joint estimate and its evidence.
+
+    Attributes
+    ----------
+    covariance : (n, n)
+        Of all parameters in the order of `names`: pose (left perturbation), scale if estimated, normals' tilts, errors
+        of the world coordinates if they are uncertain.
+    range_sigma_m
+        Noise of the ranges as the residuals show it.
+    systems
+        By (place, face): the collapsed systems at the solution.
+    """
+
+    state: CornerState
+    names: tuple[str, ...]
+    covariance: FloatArray
+    range_sigma_m: float
+    systems: Mapping[tuple[int, int], FaceSystem]
+    world: FloatArray
+    world_sigma_m: float
+    steps: int
+    returns: int
+
+    @property
+    def pose_covariance(self) -> FloatArray:
+        """(6, 6) of T_world_lidar's left perturbation."""
+        return self.covariance[:6, :6]
+
+
+@dataclass(frozen=True)
+class CornerOptions:
+    """What is estimated: the scale if `estimate_scale`; world errors if `world_sigma_m` is above zero."""
+
+    world_sigma_m: float = 0.0
+    estimate_scale: bool = False
+
+
+@dataclass(eq=False)
+class _Face:
+    place: int
+    face: int
+    directions: FloatArray
+    range_m: FloatArray
+    residual: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+
+def tangents(normal: FloatArray) -> FloatArray:
+    """Two unit directions (3, 2) across a normal, along which its tilts are counted."""
+    return np.column_stack(perpendicular_pair(normal))
+
+
+def face_residuals(returns: FaceReturns, normal: FloatArray, corner: FloatArray) -> FloatArray:
+    """Measured minus expected ranges (N,), metres."""
+    return np.asarray(returns.range_m - (normal @ corner) / (returns.directions @ normal))
+
+
+def _rows(directions: FloatArray, normal: FloatArray, corner: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Expected ranges (N,), and their derivatives (N, 3) by the plane's shift and two tilts about the corner."""
+    slope = directions @ normal
+    expected = (normal @ corner) / slope
+    E = tangents(normal)
+    rows = np.empty((len(slope), 3))
+    rows[:, 0] = 1.0 / slope
+    rows[:, 1:] = ((corner @ E) - expected[:, None] * (directions @ E)) / slope[:, None]
+    return expected, rows
+
+
+def _loss_terms(residual: FloatArray, sigma_m: float) -> tuple[FloatArray, FloatArray]:
+    """Tukey's weight psi(r)/r and the derivative of psi, of residuals (N,)."""
+    z2 = np.minimum((residual / (TUKEY_K * sigma_m)) ** 2, 1.0)
+    return (1.0 - z2) ** 2, (1.0 - z2) * (1.0 - 5.0 * z2)
+
+
+def _system(face: _Face, normal: FloatArray, corner: FloatArray, sigma_m: float) -> FaceSystem:
+    expected, rows = _rows(face.directions, normal, corner)
+    face.residual = face.range_m - expected
+    weight, _ = _loss_terms(face.residual, sigma_m)
+    weighted = rows * (weight / sigma_m**2)[:, None]
+    return FaceSystem(weighted.T @ rows, weighted.T @ face.residual, float(weight.sum()))
+
+
+def fit_corner(
+    faces: Mapping[int, FaceReturns], normals: FloatArray, corner: FloatArray, sigma_m: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Three free planes through one place's returns: corner (3,), normals (3, 3), range noise (m).
+
+    Parameters
+    ----------
+    faces
+        Returns of all three faces.
+    normals, corner, sigma_m
+        Where to start.
+
+    Raises
+    ------
+    UndeterminedError
+        If a face's returns do not determine its plane.
+    """
+    for _ in range(MAX_STEPS):
+        residuals, moves = [], []
+        for j in range(3):
+            face = _Face(0, j, faces[j].directions, faces[j].range_m)
+            system = _system(face, normals[j], corner, sigma_m)
+            residuals.append(face.residual)
+            moves.append(_solve(system.information, system.gradient, f"face {j + 1} of the target"))
+        tilted = np.stack([unit(n + tangents(n) @ m[1:]) for n, m in zip(normals, moves, strict=True)])
+        shift = np.linalg.solve(tilted, [m[0] for m in moves])
+        normals, corner = tilted, corner + shift
+        sigma_m = max(mad_sigma(np.concatenate(residuals), centred=True), MIN_SIGMA_M)
+        if np.linalg.norm(shift) < 1e-7:
+            break
+    return corner, normals, sigma_m
+
+
+def _solve(information: FloatArray, gradient: FloatArray, what: str) -> FloatArray:
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information / np.outer(scale, scale)
+    if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled)[0] < 1e-10:
+        raise UndeterminedError(
+            f"the returns do not determine {what}",
+            remedy="Bring the target nearer, or turn it so that several scan lines cross each face.",
+        )
+    return np.asarray(np.linalg.solve(scaled, gradient / scale) / scale)
+
+
+def fit_corner_model(
+    places: Sequence[CornerPlaceFaces], start: CornerState, sigma_m: float, options: CornerOptions | None = None
+) -> CornerFit:
+    """The joint estimate.
+
+    Parameters
+    ----------
+    places
+        Returns of the faces at each place; a face may be missing at some places.
+    start
+        Where to start: the closed forms' result.
+    sigma_m
+        A first guess of the range noise; it is estimated with the rest.
+
+    Raises
+    ------
+    UndeterminedError
+        If the places do not determine the pose.
+    """
+    options = options or CornerOptions()
+    world = np.stack([p.corner_world for p in places])
+    faces = [
+        _Face(i, j, f.directions, f.range_m)
+        for i, p in enumerate(places)
+        for j, f in sorted(p.faces.items())
+        if len(f) >= MIN_RETURNS
+    ]
+    names = parameter_names([p.position for p in places], options)
+    state, step = start, 0
+    for step in range(1, MAX_STEPS + 1):
+        information, gradient, systems = _assemble(faces, state, world, sigma_m, options)
+        delta = _solve(information, gradient, "the pose: too few places, or all on one line")
+        state = _moved(state, delta, options)
+        residuals = np.concatenate([f.residual for f in faces])
+        sigma_m = max(mad_sigma(residuals, centred=True), MIN_SIGMA_M)
+        if np.linalg.norm(delta[:6]) < 1e-9 and step > 3:
+            break
+    information, _, systems = _assemble(faces, state, world, sigma_m, options)
+    residuals = np.concatenate([f.residual for f in faces])
+    covariance = np.linalg.inv(information) * _loss_factor(residuals, sigma_m)
+    return CornerFit(
+        state, names, covariance, sigma_m, systems, world, options.world_sigma_m, step, sum(len(f.range_m) for f in faces)
+    )
+
+
+def _loss_factor(residual: FloatArray, sigma_m: float) -> float:
+    """What the loss costs: the M-estimate's variance over that of the information with weights."""
+    weight, slope = _loss_terms(residual, sigma_m)
+    psi = weight * residual / sigma_m
+    used = weight > 0.0
+    mean_slope = float(slope[used].mean())
+    return float((psi[used] ** 2).mean() / mean_slope**2 * weight[used].mean())
+
+
+def parameter_names(positions: Sequence[str], options: CornerOptions) -> tuple[str, ...]:
+    """Names of the estimate's parameters, in order."""
+    names = [f"T_world_lidar.{k}" for k in ("tx_m", "ty_m", "tz_m", "rx_rad", "ry_rad", "rz_rad")]
+    if options.estimate_scale:
+        names.append("log_scale")
+    names += [f"face_{j}.tilt_{k}_rad" for j in range(3) for k in "uv"]
+    if options.world_sigma_m > 0.0:
+        names += [f"{p}.world_{k}_m" for p in positions for k in "xyz"]
+    return tuple(names)
+
+
+def _columns(count: int, options: CornerOptions) -> tuple[int, int, int]:
+    """Where the normals' tilts and the world errors begin, and how many parameters there are."""
+    tilts = 7 if options.estimate_scale else 6
+    errors = tilts + 6
+    return tilts, errors, errors + (3 * count if options.world_sigma_m > 0.0 else 0)
+
+
+def _corner_jacobian(
+    state: CornerState, world: FloatArray, place: int, corner: FloatArray, options: CornerOptions
+) -> FloatArray:
+    """Derivative (3, n) of a place's corner in the LiDAR frame by the parameters."""
+    _, errors, width = _columns(len(world), options)
+    Rt = state.T_world_lidar.rotation.T / state.scale
+    J = np.zeros((3, width))
+    J[:, :3] = -Rt
+    J[:, 3:6] = Rt @ skew(world[place] + state.world_errors[place])
+    if options.estimate_scale:
+        J[:, 6] = -corner
+    if options.world_sigma_m > 0.0:
+        J[:, errors + 3 * place : errors + 3 * place + 3] = Rt
+    return J
+
+
+def _assemble(
+    faces: Sequence[_Face], state: CornerState, world: FloatArray, sigma_m: float, options: CornerOptions
+) -> tuple[FloatArray, FloatArray, dict[tuple[int, int], FaceSystem]]:
+    """The normal equations of the whole, from each face's own."""
+    tilts, errors, width = _columns(len(world), options)
+    information, gradient = np.zeros((width, width)), np.zeros(width)
+    corners = state.corners(world)
+    jacobians = [_corner_jacobian(state, world, i, corners[i], options) for i in range(len(world))]
+    systems = {}
+    for face in faces:
+        normal = state.normals[face.face]
+        system = _system(face, normal, corners[face.place], sigma_m)
+        B = np.zeros((3, width))
+        B[0] = normal @ jacobians[face.place]
+        B[1:, tilts + 2 * face.face : tilts + 2 * face.face + 2] = np.eye(2)
+        information += B.T @ system.information @ B
+        gradient += B.T @ system.gradient
+        systems[face.place, face.face] = system
+    if options.world_sigma_m > 0.0:
+        prior = 1.0 / options.world_sigma_m**2
+        information[errors:, errors:] += prior * np.eye(width - errors)
+        gradient[errors:] -= prior * state.world_errors.ravel()
+    return information, gradient, systems
+
+
+def _moved(state: CornerState, delta: FloatArray, options: CornerOptions) -> CornerState:
+    tilts, errors, _ = _columns(len(state.world_errors), options)
+    normals = np.stack([unit(n + tangents(n) @ delta[tilts + 2 * j : tilts + 2 * j + 2]) for j, n in enumerate(state.normals)])
+    moved = replace(
+        state,
+        T_world_lidar=Pose(
+            _exact(exp_so3(delta[3:6]) @ state.T_world_lidar.rotation),
+            Pose.exp(delta[:6]) @ state.T_world_lidar.translation,
+        ),
+        normals=normals,
+    )
+    if options.estimate_scale:
+        moved = replace(moved, scale=float(state.scale * np.exp(delta[6])))
+    if options.world_sigma_m > 0.0:
+        moved = replace(moved, world_errors=state.world_errors + delta[errors:].reshape(-1, 3))
+    return moved
+
+
+def _exact(rotation: FloatArray) -> FloatArray:
+    U, _, Vt = np.linalg.svd(rotation)
+    return np.asarray(U @ Vt)
+
+
+def frame_corners(
+    faces: Mapping[int, FaceReturns], normals: FloatArray, corner: FloatArray, frames: int, sigma_m: float
+) -> FloatArray:
+    """The corner (F, 3) of each frame alone, three free planes each; NaN where a frame's returns determine none.
+
+    One step from the place's common planes, of which a frame differs by its noise alone.
+    """
+    moves = np.full((frames, 3, 3), np.nan)
+    for j in range(3):
+        f = faces[j]
+        expected, rows = _rows(f.directions, normals[j], corner)
+        residual = f.range_m - expected
+        weight, _ = _loss_terms(residual, sigma_m)
+        H = np.zeros((frames, 3, 3))
+        g = np.zeros((frames, 3))
+        for a in range(3):
+            g[:, a] = np.bincount(f.frame, weight * rows[:, a] * residual, frames)
+            for b in range(a, 3):
+                H[:, a, b] = H[:, b, a] = np.bincount(f.frame, weight * rows[:, a] * rows[:, b], frames)
+        enough = np.bincount(f.frame, weight > 0.0, frames) >= 6
+        good = enough & (np.linalg.cond(H + 1e-12 * np.eye(3)) < 1e9)
+        moves[good, j] = np.linalg.solve(H[good], g[good][..., None])[..., 0]
+    tilted = np.stack([normals[j] + moves[:, j, 1:] @ tangents(normals[j]).T for j in range(3)], axis=1)
+    corners = np.full((frames, 3), np.nan)
+    good = np.isfinite(tilted).all(axis=(1, 2))
+    good[good] = np.abs(np.linalg.det(tilted[good])) > 1e-3
+    corners[good] = corner + np.linalg.solve(tilted[good], moves[good, :, 0][..., None])[..., 0]
+    return corners
+
+
+def place_discrepancies(fit: CornerFit) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """How each place by itself would move and turn the target against the joint estimate.
+
+    Returns
+    -------
+    (P, 6) shift in metres and turn in radians in the LiDAR frame; their covariances (P, 6, 6); the probability-free
+    statistic (P,) of each turn (three degrees of freedom); and which places (P,) determine all six numbers.
+    """
+    count = len(fit.world)
+    moves, covariances = np.zeros((count, 6)), np.tile(np.eye(6), (count, 1, 1))
+    statistic, known = np.zeros(count), np.zeros(count, dtype=bool)
+    for i in range(count):
+        H, g = np.zeros((6, 6)), np.zeros(6)
+        for j in range(3):
+            system = fit.systems.get((i, j))
+            if system is None:
+                continue
+            normal = fit.state.normals[j]
+            B = np.zeros((3, 6))
+            B[0, :3] = normal
+            B[1:, 3:] = tangents(normal).T @ -skew(normal)
+            H += B.T @ system.information @ B
+            g += B.T @ system.gradient
+        scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
+        if np.linalg.eigvalsh(H / np.outer(scale, scale))[0] < 1e-6:
+            continue
+        covariances[i] = np.linalg.inv(H)
+        moves[i] = covariances[i] @ g
+        statistic[i] = float(moves[i, 3:] @ np.linalg.solve(covariances[i, 3:, 3:], moves[i, 3:]))
+        known[i] = True
+    return moves, covariances, statistic, known
+
+
+def estimate_world_sigma(
+    places: Sequence[CornerPlaceFaces], fit: CornerFit
+) -> tuple[float, float]:
+    """How well the world coordinates seem to be measured: restricted maximum likelihood on the collapsed systems.
+
+    Parameters
+    ----------
+    fit
+        The joint estimate that took them for exact.
+
+    Returns
+    -------
+    The standard deviation in metres (0 where nothing speaks against exact ones), and twice the gain in log likelihood.
+    """
+    options = CornerOptions(1.0, "log_scale" in fit.names)
+    faces = [_Face(i, j, p.faces[j].directions, p.faces[j].range_m) for i, p in enumerate(places) for j in p.faces if (i, j) in fit.systems]
+    information, gradient, _ = _assemble(faces, replace(fit.state, world_errors=np.zeros_like(fit.world)), fit.world, fit.range_sigma_m, options)
+    errors = _columns(len(fit.world), options)[1]
+    size = len(gradient) - errors
+    information[errors:, errors:] -= np.eye(size)
+
+    def objective(sigma: float) -> float:
+        N = information.copy()
+        N[errors:, errors:] += np.eye(size) / sigma**2
+        return float(np.linalg.slogdet(N)[1] + 2.0 * size * np.log(sigma) - gradient @ np.linalg.solve(N, gradient))
+
+    grid = np.geomspace(1e-5, 0.5, 60)
+    values = np.array([objective(s) for s in grid])
+    best = int(np.argmin(values))
+    gain = float(values[0] - values[best])
+    return (float(grid[best]), gain) if gain > 0.5 else (0.0, 0.0)
