@@ -169,7 +169,7 @@ def _obstacles(
             continue
         height = patch.plane.distance(all_local)
         # It borders the target only if the target stands wholly on its free side, and close to it.
-        if np.mean(height > -3.0 * patch.sigma_m) > 0.97 and np.quantile(height, 0.02) < 0.1:
+        if np.mean(height > -3.0 * patch.sigma_m) > 0.97 and height.min() < 0.2:
             found.append(patch.plane)
     return tuple(found)
 
@@ -225,12 +225,9 @@ class FaceMask:
         ordered = np.sort(ranges, axis=1)
         best = np.take_along_axis(ranges, face[:, None], axis=1)[:, 0]
         step = ordered[:, 2] - ordered[:, 1] if self.convex else ordered[:, 1] - ordered[:, 0]
-        # A back face of a convex corner lies in front of what is seen if it is met there: then the beam misses.
         if self.convex:
-            away = slope > 0.02
-            with np.errstate(divide="ignore", invalid="ignore"):
-                leave = np.where(away, height / slope, np.inf)
-            best = np.where((leave > 0.0) & (leave < best), np.inf, best)
+            # Whoever leaves one of a convex corner's planes behind never enters the solid.
+            best = np.where(facing.all(axis=1), best, np.inf)
         return face.astype(np.int64), best, step
 
     def _inside(self, on_face: FloatArray, face: IntArray) -> BoolArray:

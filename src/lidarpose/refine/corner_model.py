@@ -123,6 +123,18 @@ def face_residuals(returns: FaceReturns, normal: FloatArray, corner: FloatArray)
     return np.asarray(returns.range_m - (normal @ corner) / (returns.directions @ normal))
 
 
+def direction_cells(directions: FloatArray, cell_rad: float) -> FloatArray:
+    """Which cell (N,) of a grid of angles about the bundle's middle each direction (N, 3) falls in, counted from 0."""
+    mean = directions.mean(axis=0)
+    local = directions @ np.linalg.svd(mean[None])[2].T
+    depth = np.abs(local[:, 0])
+    angles = np.column_stack([np.arctan2(local[:, 1], depth), np.arctan2(local[:, 2], depth)])
+    grid = np.floor(angles / cell_rad).astype(np.int64)
+    grid -= grid.min(axis=0)
+    flat = grid[:, 0] * (int(grid[:, 1].max()) + 1) + grid[:, 1]
+    return np.unique(flat, return_inverse=True)[1].ravel()
+
+
 def _rows(directions: FloatArray, normal: FloatArray, corner: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Expected ranges (N,), and their derivatives (N, 3) by the plane's shift and two tilts about the corner."""
     slope = directions @ normal
@@ -233,7 +245,15 @@ def fit_corner_model(
     residuals = np.concatenate([f.residual for f in faces])
     covariance = np.linalg.inv(information) * _loss_factor(residuals, sigma_m)
     return CornerFit(
-        state, names, covariance, sigma_m, systems, world, options.world_sigma_m, step, sum(len(f.range_m) for f in faces)
+        state,
+        names,
+        covariance,
+        sigma_m,
+        systems,
+        world,
+        options.world_sigma_m,
+        step,
+        sum(len(f.range_m) for f in faces),
     )
 
 
@@ -307,7 +327,9 @@ def _assemble(
 
 def _moved(state: CornerState, delta: FloatArray, options: CornerOptions) -> CornerState:
     tilts, errors, _ = _columns(len(state.world_errors), options)
-    normals = np.stack([unit(n + tangents(n) @ delta[tilts + 2 * j : tilts + 2 * j + 2]) for j, n in enumerate(state.normals)])
+    normals = np.stack(
+        [unit(n + tangents(n) @ delta[tilts + 2 * j : tilts + 2 * j + 2]) for j, n in enumerate(state.normals)]
+    )
     moved = replace(
         state,
         T_world_lidar=Pose(
@@ -391,9 +413,7 @@ def place_discrepancies(fit: CornerFit) -> tuple[FloatArray, FloatArray, FloatAr
     return moves, covariances, statistic, known
 
 
-def estimate_world_sigma(
-    places: Sequence[CornerPlaceFaces], fit: CornerFit
-) -> tuple[float, float]:
+def estimate_world_sigma(places: Sequence[CornerPlaceFaces], fit: CornerFit) -> tuple[float, float]:
     """How well the world coordinates seem to be measured: restricted maximum likelihood on the collapsed systems.
 
     Parameters
@@ -406,8 +426,15 @@ def estimate_world_sigma(
     The standard deviation in metres (0 where nothing speaks against exact ones), and twice the gain in log likelihood.
     """
     options = CornerOptions(1.0, "log_scale" in fit.names)
-    faces = [_Face(i, j, p.faces[j].directions, p.faces[j].range_m) for i, p in enumerate(places) for j in p.faces if (i, j) in fit.systems]
-    information, gradient, _ = _assemble(faces, replace(fit.state, world_errors=np.zeros_like(fit.world)), fit.world, fit.range_sigma_m, options)
+    faces = [
+        _Face(i, j, p.faces[j].directions, p.faces[j].range_m)
+        for i, p in enumerate(places)
+        for j in p.faces
+        if (i, j) in fit.systems
+    ]
+    information, gradient, _ = _assemble(
+        faces, replace(fit.state, world_errors=np.zeros_like(fit.world)), fit.world, fit.range_sigma_m, options
+    )
     errors = _columns(len(fit.world), options)[1]
     size = len(gradient) - errors
     information[errors:, errors:] -= np.eye(size)

@@ -55,7 +55,7 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class CornerTruth:
-    """What was true: the pose, the corners (P, 3) and the target's face normals (3, 3) in the LiDAR frame."""
+    """What was true: the pose, the corners (P, 3) and the target's face normals (3, 3) in the clouds' frame."""
 
     T_world_lidar: Pose
     corners_lidar: FloatArray
@@ -247,7 +247,7 @@ def simulate_corner_session(spec: CornerSceneSpec) -> tuple[CornerSession, Corne
     table = INSTRUMENTS[spec.lidar]()
     corners = corner_places(spec.places, T_world_lidar, ground_m, target, table, rng)
     surroundings = _surroundings(spec, T_world_lidar.translation, ground_m, corners, rng)
-    to_lidar = T_world_lidar.inverse()
+    to_source = _to_source(spec) @ T_world_lidar.inverse()
     places = []
     for i, corner in enumerate(corners):
         here = _turned(target, np.radians(spec.turned_deg)) if i == spec.turned_place else target
@@ -255,7 +255,7 @@ def simulate_corner_session(spec: CornerSceneSpec) -> tuple[CornerSession, Corne
         cast = cast_scene(table, solids, T_world_lidar, rng)
         clouds = tuple(_cloud(cast, spec, f"clouds/p{i:02d}/{k:03d}.pcd", rng) for k in range(spec.frames))
         measured = corner + rng.normal(0.0, 1.0, 3) * spec.world_sigma_m
-        near = to_lidar @ corner + rng.uniform(-0.1, 0.1, 3) if spec.hints else None
+        near = to_source @ corner + rng.uniform(-0.1, 0.1, 3) if spec.hints else None
         places.append(CornerPlace(f"p{i:02d}", measured, clouds, near))
     session = CornerSession(
         "simulated",
@@ -264,8 +264,8 @@ def simulate_corner_session(spec: CornerSceneSpec) -> tuple[CornerSession, Corne
         cloud_frame="camera" if spec.lidar == "turntable" else "lidar",
         lidar=LidarSpec(spec.lidar, spec.defects.range_sigma_m),
     )
-    normals = to_lidar.rotate(target.face_normals)
-    return session, CornerTruth(T_world_lidar, np.asarray(to_lidar @ corners), corners, normals)
+    normals = to_source.rotate(target.face_normals)
+    return session, CornerTruth(to_source.inverse(), np.asarray(to_source @ corners), corners, normals)
 
 
 def _resolve(spec: CornerSceneSpec) -> tuple[Pose, TargetKind, float]:
@@ -281,5 +281,13 @@ def _resolve(spec: CornerSceneSpec) -> tuple[Pose, TargetKind, float]:
 
 
 def _cloud(cast: CastScene, spec: CornerSceneSpec, name: str, rng: np.random.Generator) -> MemoryCloud:
+    points = _to_source(spec).rotate(cast.frame(spec.defects, rng))
     frame = "camera" if spec.lidar == "turntable" else "lidar"
-    return MemoryCloud(name, Cloud(cast.frame(spec.defects, rng).astype(np.float32), frame=frame))
+    return MemoryCloud(name, Cloud(points.astype(np.float32), frame=frame))
+
+
+def _to_source(spec: CornerSceneSpec) -> Pose:
+    """From the instrument's frame (x forward, z up) to that of the clouds: a camera's is optical."""
+    if spec.lidar != "turntable":
+        return Pose.identity()
+    return Pose(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.zeros(3))

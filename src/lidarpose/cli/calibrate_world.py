@@ -1,0 +1,165 @@
+"""The world branch of `lidarpose calibrate` and `lidarpose inspect`: corner sessions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lidarpose.model.calibration import WorldCalibration
+    from lidarpose.model.corner_session import CornerSession
+
+WORLD_METHODS = ("joint", "paper", "paper-approx", "ransac", "harris")
+
+
+def calibrate_world_session(
+    session_folder: Path,
+    output: Path,
+    *,
+    method: str = "joint",
+    estimate_scale: bool | None = None,
+    seed: int = 0,
+    json: bool = False,
+    quiet: bool = False,
+) -> WorldCalibration:
+    """Calibrate a corner session and write `output`/calibration.json.
+
+    Parameters
+    ----------
+    session_folder
+        A folder whose session.toml has the format lidarpose/corner-session@1.
+    output
+        The folder to write to.
+    method
+        One of `WORLD_METHODS`.
+    estimate_scale
+        Overrules the session's own `estimate_scale`, if given.
+    seed
+        For the random choices of detection.
+    json
+        Print one JSON object in place of the summary.
+
+    Raises
+    ------
+    InputError
+        For unreadable input, and methods that are not known.
+    UndeterminedError
+        If the data determine no pose.
+    """
+    from lidarpose.cli.console import progress
+    from lidarpose.errors import InputError
+    from lidarpose.storage.calibration import write_calibration
+    from lidarpose.storage.corner_session import read_corner_session
+    from lidarpose.workflows.world import calibrate_world
+
+    methods = {name: name for name in WORLD_METHODS}
+    if method not in methods:
+        raise InputError("--method", f"is {method!r}", expected="for a corner session: " + ", ".join(WORLD_METHODS))
+    session = read_corner_session(session_folder)
+    steps = len(session.places) + sum(len(p.clouds) for p in session.places)
+    with progress("Reading clouds", steps, quiet=quiet or json) as advance:
+        calibration = calibrate_world(
+            session,
+            method,  # type: ignore[arg-type]
+            estimate_scale=estimate_scale,
+            seed=seed,
+            tick=lambda: advance(),
+        )
+    file = output / "calibration.json"
+    write_calibration(file, calibration)
+    _print_result(calibration, file, json)
+    return calibration
+
+
+def _print_result(calibration: WorldCalibration, file: Path, json: bool) -> None:
+    from lidarpose.cli.console import out, print_json
+    from lidarpose.storage.calibration import calibration_document
+
+    if json:
+        print_json(calibration_document(calibration))
+        return
+    console = out()
+    for line in summary_lines(calibration):
+        console.print(line)
+    console.print(f"written to {file}")
+
+
+def summary_lines(calibration: WorldCalibration) -> list[str]:
+    """What a person wants to read of a world calibration: millimetres and degrees."""
+    quality = calibration.quality
+    figures: dict[str, Any] = dict(quality.figures) if quality else {}
+    x, y, z = (1e3 * float(v) for v in calibration.T_world_source.translation)
+    qx, qy, qz, qw = (float(v) for v in calibration.T_world_source.quaternion_xyzw)
+    lines = [
+        f"world <- {calibration.source}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, "
+        f"quaternion xyzw ({qx:.7f}, {qy:.7f}, {qz:.7f}, {qw:.7f})",
+    ]
+    if "sigma_position_mm" in figures:
+        lines.append(
+            f"standard deviations: {figures['sigma_position_mm']:.3g} mm, {figures['sigma_rotation_deg']:.3g} deg "
+            f"(in the worst direction), from {figures.get('places_used', '?')} places"
+        )
+    if calibration.scale != 1.0:
+        lines.append(f"scale: {calibration.scale:.6f}")
+    if "range_sigma_mm" in figures:
+        lines.append(f"range noise found: {figures['range_sigma_mm']:.2f} mm")
+    if quality:
+        lines.append(f"verdict: {quality.verdict}")
+        lines += [f"  - {reason}" for reason in quality.reasons]
+    return lines
+
+
+def inspect_world_session(session_folder: Path) -> dict[str, Any]:
+    """What is there, what is missing, and what will be badly determined, without opening a cloud.
+
+    Raises
+    ------
+    InputError
+        For unreadable input.
+    """
+    from lidarpose.storage.corner_session import read_corner_session
+
+    session = read_corner_session(session_folder)
+    return {
+        "format": "lidarpose/corner-session@1",
+        "places": [
+            {
+                "position": p.position,
+                "corner_world_m": [float(x) for x in p.corner_world],
+                "frames": len(p.clouds),
+                "hint": p.near is not None,
+            }
+            for p in session.places
+        ],
+        "cloud_frame": session.cloud_frame,
+        "warnings": layout_warnings(session),
+    }
+
+
+def layout_warnings(session: CornerSession) -> list[str]:
+    """What the places' layout will determine badly, whatever the clouds hold."""
+    import numpy as np
+
+    from lidarpose.errors import UndeterminedError
+    from lidarpose.workflows.corner_target import check_layout, world_coordinates
+
+    warnings = []
+    try:
+        check_layout(session)
+    except UndeterminedError as error:
+        return [error.what]
+    world = world_coordinates(session)
+    spread = np.linalg.svd(world - world.mean(axis=0), compute_uv=False) / np.sqrt(len(world))
+    if spread[0] > 100.0:
+        warnings.append(f"the places are {spread[0]:.0f} m apart: are the world coordinates in millimetres?")
+    if spread[0] < 0.3:
+        warnings.append(f"the places are close together ({spread[0]:.2f} m RMS): the rotation will be poor")
+    if spread[1] < 0.15 * spread[0]:
+        warnings.append("the places are nearly on one line: the rotation about it will be poor")
+    if spread[2] < 0.02:
+        warnings.append(
+            "the places are in one plane: left-handed coordinates cannot be told; put one place at another height"
+        )
+    if session.world_sigma_m is None:
+        warnings.append("world_sigma_m is not given: the noise of the world coordinates is estimated from the misfit")
+    return warnings

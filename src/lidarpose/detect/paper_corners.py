@@ -1,0 +1,115 @@
+"""The corner paper's ways to a frame's corner, and its rival: RANSAC planes with or without the second screening
+(section 2.1), and the 3D Harris detector."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.planes import Plane, fit_plane, intersect_three_planes
+from lidarpose.model.corner_result import CornerCandidate
+
+# Section 3.1: "points farther than 0.01 m from the plane do not belong to it".
+THRESHOLD_M = 0.01
+SAMPLES = 300
+CLEARANCE = 2.5
+GROUND_CLEARANCE_M = 0.04
+MIN_POINTS = 12
+SCREENING_RAD = np.radians(20.0)
+SCREENING_NEIGHBOURS = 24
+HARRIS_RADIUS_M = 0.1
+HARRIS_K = 0.04
+
+
+def ransac_corner(points: FloatArray, sighting: CornerCandidate, *, seed: int, screening: bool) -> FloatArray | None:
+    """The common point (3,) of three planes that RANSAC finds one after the other around a sighted corner.
+
+    Parameters
+    ----------
+    points : (N, 3)
+        One frame around the target.
+    sighting
+        Where the target is: the region of interest that the paper filters out first, and which plane is which.
+    screening
+        Whether to fit again to the points whose local normal agrees with the plane's.
+    """
+    reach = min(float(np.linalg.norm(o - sighting.corner, axis=1).max()) for o in sighting.outlines)
+    region = points[np.linalg.norm(points - sighting.corner, axis=1) < min(0.85 * reach, 0.6)]
+    for ground in sighting.obstacles:
+        region = region[ground.distance(region) > GROUND_CLEARANCE_M]
+    rng = np.random.default_rng(seed)
+    planes: list[Plane] = []
+    remaining = region
+    for _ in range(3):
+        if len(remaining) < MIN_POINTS:
+            return None
+        inside = _best_sample(remaining, rng)
+        if inside.sum() < MIN_POINTS:
+            return None
+        chosen = _screened(remaining[inside]) if screening else remaining[inside]
+        if len(chosen) < MIN_POINTS:
+            return None
+        try:
+            planes.append(fit_plane(chosen))
+        except ValueError:
+            return None
+        # What the noise put just outside the slab is still of this plane, and no second one.
+        remaining = remaining[np.abs(planes[-1].distance(remaining)) > CLEARANCE * THRESHOLD_M]
+    try:
+        corner = intersect_three_planes((planes[0], planes[1], planes[2]))
+    except ValueError:
+        return None
+    return corner if np.linalg.norm(corner - sighting.corner) < 0.3 else None
+
+
+def _best_sample(points: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Inliers (N,) of the plane through three points that has most of them."""
+    triples = rng.integers(0, len(points), (SAMPLES, 3))
+    a, b, c = (points[triples[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1)
+    good = length > 1e-6
+    normals = normals[good] / length[good, None]
+    distance = points @ normals.T - np.einsum("ij,ij->i", normals, a[good])
+    inside = np.abs(distance) < THRESHOLD_M
+    return np.asarray(inside[:, int(np.argmax(inside.sum(axis=0)))])
+
+
+def _screened(points: FloatArray) -> FloatArray:
+    """The second screening: points whose neighbourhood's normal is within a threshold of the plane's."""
+    from scipy.spatial import cKDTree
+
+    k = min(SCREENING_NEIGHBOURS, len(points))
+    _, neighbours = cKDTree(points).query(points, k=k)
+    around = points[neighbours]
+    d = around - around.mean(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", d, d))
+    agrees = np.abs(vectors[:, :, 0] @ fit_plane(points).normal) > np.cos(SCREENING_RAD)
+    # Neighbours on one scan line have no normal to judge by.
+    lined_up = values[:, 1] < 0.05 * values[:, 2]
+    return np.asarray(points[agrees | lined_up])
+
+
+def harris_corner(points: FloatArray, near: FloatArray) -> FloatArray | None:
+    """The point (3,) with the strongest 3D Harris response within 0.3 m of `near`.
+
+    The response is ``det(M) - k trace(M)^2`` of the scatter M of the normals around a point (corner paper, 3.1).
+    """
+    from scipy.spatial import cKDTree
+
+    if len(points) < MIN_POINTS:
+        return None
+    tree = cKDTree(points)
+    _, neighbours = tree.query(points, k=min(SCREENING_NEIGHBOURS, len(points)))
+    around = points[neighbours]
+    d = around - around.mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", d, d))[1][:, :, 0]
+    close = np.flatnonzero(np.linalg.norm(points - near, axis=1) < 0.3)
+    best, strongest = None, -np.inf
+    for k in close:
+        ball = tree.query_ball_point(points[k], HARRIS_RADIUS_M)
+        M = normals[ball].T @ normals[ball] / len(ball)
+        response = float(np.linalg.det(M) - HARRIS_K * np.trace(M) ** 2)
+        if response > strongest and len(ball) >= 8:
+            best, strongest = points[k], response
+    return best

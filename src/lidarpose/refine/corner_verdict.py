@@ -1,0 +1,278 @@
+"""Is a world calibration good? What the data say against it, by name, and the figures behind the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.se3 import Pose, UncertainPose, nearest_rotation, skew
+from lidarpose.model.calibration import Quality, Verdict
+from lidarpose.model.corner_result import CornerPlaceFaces
+from lidarpose.model.corner_session import CloudFrame
+from lidarpose.model.observation import LeftOut
+from lidarpose.refine.corner_model import CornerFit, direction_cells, face_residuals, place_discrepancies
+
+GOOD_ROTATION_DEG, GOOD_POSITION_MM = 0.1, 5.0
+USABLE_ROTATION_DEG, USABLE_POSITION_MM = 1.0, 50.0
+# A turn of the target: far beyond chance (three degrees of freedom) and large enough to matter.
+TURN_STATISTIC, TURN_DEG = 30.0, 0.2
+# World coordinates that disagree by more than this with one another are no measurement.
+WORLD_SIGMA_DOUBTFUL_MM = 10.0
+NOISE_RATIO_DOUBTFUL = 3.0
+CELL_RAD = np.radians(1.5)
+
+
+@dataclass(frozen=True, eq=False)
+class CornerEvidence:
+    """What the workflow knows beside the fit."""
+
+    positions: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]
+    oddity: str
+    stated_world_sigma_m: float | None
+    stated_range_sigma_m: float | None
+    cloud_frame: CloudFrame
+    frame_scatter_m: Mapping[str, FloatArray]
+
+
+class _Verdict:
+    """Collects reasons; the worst decides."""
+
+    def __init__(self) -> None:
+        self.verdict: Verdict = "good"
+        self.reasons: list[str] = []
+
+    def reject(self, reason: str) -> None:
+        self.verdict = "rejected"
+        self.reasons.append(reason)
+
+    def doubt(self, reason: str) -> None:
+        if self.verdict == "good":
+            self.verdict = "doubtful"
+        self.reasons.append(reason)
+
+
+def judge_corner_fit(fit: CornerFit, places: Sequence[CornerPlaceFaces], evidence: CornerEvidence) -> Quality:
+    """Verdict on the joint estimate, with reasons and figures."""
+    verdict = _Verdict()
+    factor = _common_error_factor(fit, places)
+    corners = fit.state.corners(fit.world)
+    moves, covariances, statistic, known = place_discrepancies(fit)
+    figures = _figures(fit.state.T_world_lidar, fit.pose_covariance * factor, evidence)
+    figures |= {
+        "range_sigma_mm": 1e3 * fit.range_sigma_m,
+        "world_sigma_mm": 1e3 * fit.world_sigma_m,
+        "covariance_factor": factor,
+        "returns": fit.returns,
+        "steps": fit.steps,
+        "places_used": len(places),
+        "faces_angles_deg": _face_angles_deg(fit.state.normals),
+    }
+    if "log_scale" in fit.names:
+        figures["scale_sigma"] = float(np.sqrt(fit.covariance[6, 6] * factor)) * fit.state.scale
+    _judge_common(verdict, fit.state.T_world_lidar, fit.world, corners, figures, evidence)
+    _judge_turns(verdict, places, moves, statistic, known)
+    _judge_world(verdict, fit, places, evidence)
+    _judge_noise(verdict, fit, evidence)
+    return Quality(verdict.verdict, tuple(verdict.reasons), figures)
+
+
+def judge_corners(
+    T_world_lidar: Pose, world: FloatArray, lidar: FloatArray, covariance: FloatArray, evidence: CornerEvidence
+) -> Quality:
+    """Verdict on a pose from corners alone (the paper's methods)."""
+    verdict = _Verdict()
+    figures = _figures(T_world_lidar, covariance, evidence)
+    residual = T_world_lidar @ lidar - world
+    figures["corner_rms_mm"] = 1e3 * float(np.sqrt((residual**2).sum(axis=1).mean()))
+    figures["places_used"] = len(world)
+    _judge_common(verdict, T_world_lidar, world, lidar, figures, evidence)
+    if figures["corner_rms_mm"] > 30.0:
+        verdict.doubt(f"the corners miss their world coordinates by {figures['corner_rms_mm']:.0f} mm RMS")
+    return Quality(verdict.verdict, tuple(verdict.reasons), figures)
+
+
+def _figures(pose: Pose, covariance: FloatArray, evidence: CornerEvidence) -> dict[str, Any]:
+    uncertain = UncertainPose(pose, covariance)
+    position = np.sqrt(np.linalg.eigvalsh(uncertain.centre_covariance())[-1])
+    rotation = np.sqrt(np.linalg.eigvalsh(uncertain.rotation_covariance())[-1])
+    return {
+        "sigma_position_mm": 1e3 * float(position),
+        "sigma_rotation_deg": float(np.degrees(rotation)),
+        "left_out": [{"what": item.what, "reason": item.reason} for item in evidence.left_out],
+        "corner_scatter_mm": {k: [round(1e3 * float(x), 4) for x in v] for k, v in evidence.frame_scatter_m.items()},
+    }
+
+
+def _face_angles_deg(normals: FloatArray) -> list[float]:
+    return [
+        float(np.degrees(np.arccos(np.clip(normals[a] @ normals[b], -1.0, 1.0)))) for a, b in ((0, 1), (0, 2), (1, 2))
+    ]
+
+
+def _judge_common(
+    verdict: _Verdict,
+    pose: Pose,
+    world: FloatArray,
+    lidar: FloatArray,
+    figures: dict[str, Any],
+    evidence: CornerEvidence,
+) -> None:
+    if evidence.oddity:
+        verdict.reject(evidence.oddity)
+    for item in evidence.left_out:
+        if "," not in item.what and ":" not in item.what:
+            verdict.doubt(f"{item.what} is left out: {item.reason}")
+    _judge_handedness(verdict, pose, world, lidar, evidence)
+    _judge_swaps(verdict, pose, world, lidar, evidence)
+    rotation, position = figures["sigma_rotation_deg"], figures["sigma_position_mm"]
+    layout = _layout_remark(world)
+    if not (rotation <= USABLE_ROTATION_DEG and position <= USABLE_POSITION_MM):
+        verdict.reject(f"the pose is known to {rotation:.2g} deg and {position:.2g} mm only{layout}")
+    elif not (rotation <= GOOD_ROTATION_DEG and position <= GOOD_POSITION_MM):
+        verdict.doubt(f"the pose is known to {rotation:.2g} deg and {position:.2g} mm{layout}")
+
+
+def _layout_remark(world: FloatArray) -> str:
+    """What about the places makes the pose uncertain, and what to do."""
+    spread = np.linalg.svd(world - world.mean(axis=0), compute_uv=False) / np.sqrt(len(world))
+    if spread[0] < 0.3:
+        return f": the places are too close together ({spread[0]:.2f} m RMS); move the target farther"
+    if spread[1] < 0.15 * spread[0]:
+        return ": the places are nearly on one line; move the target off it"
+    return ""
+
+
+def _judge_handedness(
+    verdict: _Verdict, pose: Pose, world: FloatArray, lidar: FloatArray, evidence: CornerEvidence
+) -> None:
+    """Left-handed coordinates: they fit mirrored only; or, places in one plane, they turn the LiDAR upside down."""
+    cw, cp = world - world.mean(axis=0), lidar - lidar.mean(axis=0)
+    proper = _rms(cw - cp @ nearest_rotation(cw.T @ cp).T)
+    U, _, Vt = np.linalg.svd(cw.T @ cp)
+    if np.linalg.det(U @ Vt) > 0.0:
+        U = U * [1.0, 1.0, -1.0]
+    mirrored = _rms(cw - cp @ (U @ Vt).T)
+    if mirrored < 0.3 * proper and proper > 0.01:
+        verdict.reject("the world coordinates are left-handed (mirrored): they fit only if one axis is turned round")
+        return
+    flat_sigma = np.linalg.svd(cp, compute_uv=False)[2] / np.sqrt(len(cp))
+    if flat_sigma > 0.02:
+        return
+    up = np.array([0.0, 0.0, 1.0]) if evidence.cloud_frame == "lidar" else np.array([0.0, -1.0, 0.0])
+    normal = np.linalg.svd(cw)[2][2]
+    if abs(normal[2]) > 0.9 and (pose.rotation @ up)[2] < -0.2:
+        verdict.doubt(
+            "all places lie in one plane, and the result turns the sensor upside down: either it hangs so (or the "
+            "world's z points down), or the world coordinates are left-handed; a place at another height tells"
+        )
+
+
+def _judge_swaps(verdict: _Verdict, pose: Pose, world: FloatArray, lidar: FloatArray, evidence: CornerEvidence) -> None:
+    """Two rows exchanged: a misfit that an exchange removes."""
+    residual = _rms(pose @ lidar - world)
+    if residual < 0.02 or len(world) > 12 or len(world) < 4:
+        return
+    cw, cp = world - world.mean(axis=0), lidar - lidar.mean(axis=0)
+    for a, b in combinations(range(len(world)), 2):
+        swapped = cw.copy()
+        swapped[[a, b]] = cw[[b, a]]
+        if _rms(swapped - cp @ nearest_rotation(swapped.T @ cp).T) < 0.2 * residual:
+            names = f"{evidence.positions[a]} and {evidence.positions[b]}"
+            verdict.reject(f"the rows of {names} look swapped: exchanged they fit")
+            return
+
+
+def _judge_turns(
+    verdict: _Verdict,
+    places: Sequence[CornerPlaceFaces],
+    moves: FloatArray,
+    statistic: FloatArray,
+    known: FloatArray,
+) -> None:
+    if not known.any():
+        return
+    turn_deg = np.degrees(np.linalg.norm(moves[:, 3:], axis=1))
+    suspects = known & (statistic > TURN_STATISTIC) & (turn_deg > TURN_DEG)
+    if suspects.any():
+        worst = int(np.argmax(np.where(suspects, turn_deg, 0.0)))
+        verdict.doubt(
+            f"the target seems turned by {turn_deg[worst]:.1f} deg at {places[worst].position} against the other "
+            "places; it must keep its orientation"
+        )
+
+
+def _judge_world(
+    verdict: _Verdict, fit: CornerFit, places: Sequence[CornerPlaceFaces], evidence: CornerEvidence
+) -> None:
+    errors_mm = 1e3 * np.linalg.norm(fit.state.world_errors, axis=1)
+    if fit.world_sigma_m <= 0.0:
+        return
+    worst = int(np.argmax(errors_mm))
+    name = places[worst].position
+    if evidence.stated_world_sigma_m:
+        if errors_mm[worst] > 5.0e3 * evidence.stated_world_sigma_m:
+            verdict.doubt(
+                f"the world coordinates of {name} are off by {errors_mm[worst]:.1f} mm, far more than the "
+                f"{1e3 * evidence.stated_world_sigma_m:.1f} mm stated"
+            )
+    elif 1e3 * fit.world_sigma_m > WORLD_SIGMA_DOUBTFUL_MM:
+        verdict.doubt(
+            f"world coordinates and clouds disagree by {1e3 * fit.world_sigma_m:.0f} mm a coordinate, most at {name} "
+            f"({errors_mm[worst]:.0f} mm)"
+        )
+
+
+def _judge_noise(verdict: _Verdict, fit: CornerFit, evidence: CornerEvidence) -> None:
+    stated = evidence.stated_range_sigma_m
+    if stated is not None and fit.range_sigma_m > NOISE_RATIO_DOUBTFUL * stated:
+        verdict.doubt(
+            f"ranges scatter by {1e3 * fit.range_sigma_m:.1f} mm, far more than the {1e3 * stated:.1f} mm stated: "
+            "the faces may not be flat, or may not be the target's"
+        )
+
+
+def _common_error_factor(fit: CornerFit, places: Sequence[CornerPlaceFaces]) -> float:
+    """How much wider the covariance has to be because returns of one spot err together, frame after frame.
+
+    The mean residual of each cell of 1.5 degrees should scatter as the range noise over its number of returns; faces
+    that are not flat and beams with offsets of their own make it scatter more.
+    """
+    corners = fit.state.corners(fit.world)
+    total, cells, taken = 0.0, 0, 0.0
+    for i, place in enumerate(places):
+        for j, returns in place.faces.items():
+            residual = face_residuals(returns, fit.state.normals[j], corners[i])
+            keep = np.abs(residual) < 4.0 * fit.range_sigma_m
+            cell = direction_cells(returns.directions[keep], CELL_RAD)
+            count = np.bincount(cell)
+            mean = np.bincount(cell, residual[keep]) / count
+            total += float((mean**2 * count).sum()) / fit.range_sigma_m**2
+            cells += len(count)
+            taken += 3.0
+    dof = max(cells - taken, 1.0)
+    ratio = total / dof
+    # Chance alone reaches one plus a few standard deviations of a chi-square over its degrees of freedom.
+    return float(ratio) if ratio > 1.0 + 4.0 * np.sqrt(2.0 / dof) else 1.0
+
+
+def _rms(rows: FloatArray) -> float:
+    return float(np.sqrt((rows**2).sum(axis=1).mean()))
+
+
+def cornerwise_covariance(T_world_lidar: Pose, world: FloatArray, lidar: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a least-squares pose from corners (P, 3) of standard deviations `sigma` (P, 3).
+
+    The corners' own scatter, or what they miss the world by, whichever is larger: a mean's scatter says nothing of bias.
+    """
+    rows = np.concatenate([np.hstack([np.eye(3), -skew(p)]) for p in T_world_lidar @ lidar])
+    inverse = np.linalg.inv(rows.T @ rows)
+    dof = max(3 * len(world) - 6, 1)
+    misfit = float(((T_world_lidar @ lidar - world) ** 2).sum()) / dof
+    noise = np.maximum((sigma**2 @ (T_world_lidar.rotation**2).T).ravel(), misfit)
+    return np.asarray(inverse @ (rows.T * noise) @ rows @ inverse)

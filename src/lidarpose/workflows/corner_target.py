@@ -1,0 +1,353 @@
+"""The target of a corner session: found in one frame of each place, then gathered from all frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
+from lidarpose.detect.trihedral_corner import FaceMask, find_corners
+from lidarpose.errors import InputError, UndeterminedError
+from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
+from lidarpose.model.corner_session import NEAR_RADIUS_M, CloudSource, CornerPlace, CornerSession
+from lidarpose.model.observation import LeftOut
+from lidarpose.refine.corner_model import direction_cells, face_residuals, fit_corner
+from lidarpose.solve.corner_matching import CornerMatch, match_corners
+
+# A hint is right within 0.3 m, and a target no larger than this beyond the corner.
+HINT_CROP_M = 1.5
+MIN_FACE_RETURNS = 12
+GATE_SIGMAS = 6.5
+FIRST_GATE_M = 0.05
+SPOT_RAD = np.radians(1.2)
+# The share of a face next to the corner on which the first fit stands, before its far edges are trusted.
+INNER_SHARE = 0.6
+
+Tick = Callable[[], None]
+
+
+@dataclass(frozen=True, eq=False)
+class FoundTarget:
+    """The target at each place (None where it was not found), the match behind it, and what is odd about the world.
+
+    Attributes
+    ----------
+    world : (P, 3)
+        The world coordinates under which the corners fit: those of the session unless `oddity` names what is wrong.
+    oddity
+        Why the session's own coordinates do not fit, for the user; empty if they do.
+    """
+
+    sightings: tuple[CornerCandidate | None, ...]
+    match: CornerMatch
+    world: FloatArray
+    oddity: str
+    ambiguous: bool
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceCrop:
+    """What all frames of a place hold around the target: points (N, 3) and the frame (N,) of each, ascending."""
+
+    points: FloatArray
+    frame: IntArray
+    frames: int
+
+
+def world_coordinates(session: CornerSession) -> FloatArray:
+    """The measured corners (P, 3)."""
+    return np.stack([p.corner_world for p in session.places])
+
+
+def check_layout(session: CornerSession) -> None:
+    """Refuse places that determine no pose, whatever the clouds hold.
+
+    Raises
+    ------
+    UndeterminedError
+        For fewer than three places, places on one spot, and places on one line.
+    """
+    remedy = "Record the target at three or more places, well off one line."
+    if len(session.places) < 3:
+        raise UndeterminedError(
+            f"{len(session.places)} places determine no pose; at least three are needed", remedy=remedy
+        )
+    world = world_coordinates(session)
+    spread = np.linalg.svd(world - world.mean(axis=0), compute_uv=False) / np.sqrt(len(world))
+    if spread[0] < 0.02:
+        raise UndeterminedError(
+            f"all places lie within {spread[0] * 1e3:.0f} mm of one spot: the rotation stays undetermined",
+            remedy=remedy,
+        )
+    if spread[1] < max(0.01, 0.01 * spread[0]):
+        raise UndeterminedError(
+            f"all places lie on one line (collinear, to {spread[1] * 1e3:.0f} mm): "
+            "the rotation about that line stays undetermined",
+            remedy="Move the target off the line, or raise it, at one place or more.",
+        )
+
+
+def load_points(source: CloudSource) -> FloatArray:
+    """A frame's finite points (N, 3), as stored. Raises InputError if there are too few to see anything in."""
+    points = source.load().finite().points
+    if len(points) < 3 * MIN_FACE_RETURNS:
+        raise InputError(
+            source.name, f"holds {len(points)} points with coordinates", expected="a frame that shows the target"
+        )
+    return points
+
+
+def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: None) -> FoundTarget:
+    """Find the target in the first frame of each place, near its hint or unaided.
+
+    Raises
+    ------
+    UndeterminedError
+        If no corner, or more than one, moves as the world's coordinates say.
+    """
+    check_layout(session)
+    world = world_coordinates(session)
+
+    def corners_at(place: CornerPlace) -> tuple[CornerCandidate, ...]:
+        found = place_corners(place, seed)
+        tick()
+        return found
+
+    with ThreadPoolExecutor(2) as pool:
+        candidates = list(pool.map(corners_at, session.places))
+    matches, world, oddity = _match_with_mistakes(candidates, world, session.estimate_scale)
+    if not matches:
+        raise _not_found(session, candidates)
+    best = matches[0]
+    sightings = tuple(
+        None if k is None else _reordered(here[k], order)
+        for here, k, order in zip(candidates, best.choice, best.orders, strict=True)
+    )
+    return FoundTarget(sightings, best, world, oddity, _is_ambiguous(matches))
+
+
+def place_corners(place: CornerPlace, seed: int = 0, frame: int = 0) -> tuple[CornerCandidate, ...]:
+    """All corners in one frame of a place, or those near the hint."""
+    points = load_points(place.clouds[frame])
+    if place.near is not None:
+        offset = points - place.near.astype(points.dtype)
+        points = points[np.einsum("ij,ij->i", offset, offset) < HINT_CROP_M**2]
+    patches = segment_planes(points, PlaneSearch(seed=seed))
+    return find_corners(points, patches, place.near, NEAR_RADIUS_M)
+
+
+def _reordered(candidate: CornerCandidate, order: tuple[int, int, int]) -> CornerCandidate:
+    a, b, c = (candidate.outlines[k] for k in order)
+    return replace(candidate, normals=candidate.normals[list(order)], outlines=(a, b, c))
+
+
+def _is_ambiguous(matches: Sequence[CornerMatch]) -> bool:
+    """Whether another corner fits the world as well: as many places, other corners, a residual not much worse."""
+    best = matches[0]
+    for other in matches[1:]:
+        differing = sum(a != b for a, b in zip(best.choice, other.choice, strict=True))
+        if other.places == best.places and 2 * differing >= best.places and other.rms_m < 3.0 * best.rms_m + 0.005:
+            return True
+    return False
+
+
+def _match_with_mistakes(
+    candidates: Sequence[Sequence[CornerCandidate]], world: FloatArray, free_scale: bool
+) -> tuple[tuple[CornerMatch, ...], FloatArray, str]:
+    """Match under the coordinates as they are; where they fail, under the mistakes that people make."""
+    plain = match_corners(candidates, world)
+    count = len(world)
+    if plain and plain[0].places >= max(3, count - 1):
+        return plain, world, ""
+    best = (plain, world, "")
+    best_places = plain[0].places if plain else 0
+    for mistaken, oddity in _mistakes(world, free_scale):
+        matches = match_corners(candidates, mistaken)
+        if matches and matches[0].places >= max(3, best_places + 1) and matches[0].places >= 0.6 * count:
+            best, best_places = (matches, mistaken, oddity), matches[0].places
+            if best_places == count:
+                break
+    return best
+
+
+def _mistakes(world: FloatArray, free_scale: bool) -> Iterator[tuple[FloatArray, str]]:
+    units = [(1e-3, "millimetres"), (1e-2, "centimetres"), (0.3048, "feet"), (0.0254, "inches")]
+    for factor, unit_name in units:
+        yield factor * world, f"the world coordinates look like {unit_name}, not metres"
+    yield 1e3 * world, "the world coordinates look like kilometres, or the clouds are in millimetres"
+    if free_scale:
+        for factor in np.geomspace(0.8, 1.25, 19):
+            yield factor * world, ""
+    yield world * [1.0, -1.0, 1.0], "the world coordinates are left-handed (mirrored): one axis points the wrong way"
+    if len(world) <= 12:
+        for a, b in combinations(range(len(world)), 2):
+            swapped = world.copy()
+            swapped[[a, b]] = world[[b, a]]
+            yield swapped, f"the rows {a + 1} and {b + 1} of the positions look swapped"
+
+
+def _not_found(session: CornerSession, candidates: Sequence[Sequence[CornerCandidate]]) -> UndeterminedError:
+    details = tuple(
+        f"{place.position}: {len(here)} corner{'s' * (len(here) != 1)} of three faces"
+        + (" near the hint" if place.near is not None else "")
+        for place, here in zip(session.places, candidates, strict=True)
+    )
+    return UndeterminedError(
+        "no corner of three faces moves from place to place as the world coordinates say",
+        remedy="Check the coordinates against the frames, see that three faces of the target are in view without "
+        "turning it, or give the corner's rough place in near_x_m,near_y_m,near_z_m.",
+        details=details,
+    )
+
+
+def gather(session: CornerSession, found: FoundTarget, *, tick: Tick = lambda: None) -> tuple[PlaceCrop, ...]:
+    """Cut the target's surroundings from all frames of all places."""
+    corners, radius = expected_corners(found), _crop_radius(found)
+
+    def crop(task: tuple[CloudSource, FloatArray]) -> FloatArray:
+        source, corner = task
+        points = load_points(source)
+        offset = points - corner.astype(points.dtype)
+        kept = points[np.einsum("ij,ij->i", offset, offset) < radius * radius]
+        tick()
+        return kept.astype(np.float64)
+
+    crops = []
+    with ThreadPoolExecutor(2) as pool:
+        for place, corner in zip(session.places, corners, strict=True):
+            parts = list(pool.map(crop, [(source, corner) for source in place.clouds]))
+            frame = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
+            crops.append(PlaceCrop(np.concatenate(parts), frame, len(parts)))
+    return tuple(crops)
+
+
+def expected_corners(found: FoundTarget) -> FloatArray:
+    """The corner (P, 3) at each place in the clouds' frame: as sighted, or as the match predicts."""
+    predicted = found.match.T_world_lidar.inverse() @ found.world
+    return np.stack([p if s is None else s.corner for s, p in zip(found.sightings, predicted, strict=True)])
+
+
+def _crop_radius(found: FoundTarget) -> float:
+    reach = [
+        float(np.linalg.norm(outline - s.corner, axis=1).max())
+        for s in found.sightings
+        if s is not None
+        for outline in s.outlines
+    ]
+    return max(reach) + 0.15
+
+
+def margin_m(corner: FloatArray) -> float:
+    """How far from an edge a beam still meets one face alone: half a beam's width, and a little."""
+    return 0.002 + 0.0015 * float(np.linalg.norm(corner))
+
+
+def mask_of(candidate: CornerCandidate, corner: FloatArray, normals: FloatArray, share: float = 1.0) -> FaceMask:
+    """The beams of a sighting's faces, for a better corner and better normals than its own.
+
+    With `share` below 1, only the faces' parts next to the corner.
+    """
+    a, b, c = (corner + share * (outline - candidate.corner) for outline in candidate.outlines)
+    return FaceMask(corner, normals, candidate.convex, (a, b, c), candidate.obstacles, margin_m(corner))
+
+
+def select_faces(
+    crop: PlaceCrop, mask: FaceMask, gate_m: float, sigma_m: float | None = None
+) -> dict[int, FaceReturns]:
+    """Each face's returns at a place; with the noise known, without the spots that are plainly something else."""
+    index, face = mask.select(crop.points, gate_m)
+    faces = {}
+    for j in range(3):
+        mine = index[face == j]
+        if len(mine) < MIN_FACE_RETURNS:
+            continue
+        points = crop.points[mine]
+        ranges = np.linalg.norm(points, axis=1)
+        returns = FaceReturns(points / ranges[:, None], ranges, crop.frame[mine])
+        if sigma_m is not None:
+            returns = _second_screening(returns, mask.normals[j], mask.corner, sigma_m)
+        if len(returns) >= MIN_FACE_RETURNS:
+            faces[j] = returns
+    return faces
+
+
+def _second_screening(returns: FaceReturns, normal: FloatArray, corner: FloatArray, sigma_m: float) -> FaceReturns:
+    """Drop spots of the face whose returns are all off the plane: ground at the target's foot, a strap, a hand.
+
+    The paper screens by neighbours' normals; a spot's mean residual over all frames says the same, and sooner.
+    """
+    residual = face_residuals(returns, normal, corner)
+    cell = direction_cells(returns.directions, SPOT_RAD)
+    count = np.bincount(cell)
+    mean = np.bincount(cell, residual) / count
+    odd = (np.abs(mean) > 0.75 * sigma_m) & (np.abs(mean) * np.sqrt(count) > 4.5 * sigma_m)
+    keep = ~odd[cell]
+    return FaceReturns(returns.directions[keep], returns.range_m[keep], returns.frame[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceFit:
+    """One place by itself: the corner (3,), normals (3, 3) and range noise of three free planes."""
+
+    corner: FloatArray
+    normals: FloatArray
+    sigma_m: float
+
+
+def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> PlaceFit | None:
+    """Three free planes at one place, selected and fitted in turn; None where they do not settle."""
+    corner, normals = sighting.corner, sighting.normals
+    gate_m = max(FIRST_GATE_M, GATE_SIGMAS * sigma_m)
+    try:
+        for step in range(5):
+            inner = step < 2
+            mask = mask_of(sighting, corner, normals, INNER_SHARE if inner else 1.0)
+            faces = select_faces(crop, mask, gate_m, None if inner else sigma_m)
+            if len(faces) < 3:
+                return None
+            corner, normals, sigma_m = fit_corner(faces, normals, corner, sigma_m)
+            gate_m = min(gate_m, max(GATE_SIGMAS * sigma_m, 0.002))
+    except UndeterminedError:
+        return None
+    if np.linalg.norm(corner - sighting.corner) > 0.15:
+        return None
+    return PlaceFit(corner, normals, sigma_m)
+
+
+def observe(
+    session: CornerSession,
+    found: FoundTarget,
+    crops: Sequence[PlaceCrop],
+    corners: FloatArray,
+    normals: FloatArray,
+    sigma_m: float,
+) -> tuple[list[CornerPlaceFaces], list[LeftOut]]:
+    """Returns of the faces at each place, selected by common normals; what is left out, and why."""
+    places, left_out = [], []
+    reference = max((s for s in found.sightings if s is not None), key=lambda s: s.support)
+    for place, sighting, crop, corner in zip(session.places, found.sightings, crops, corners, strict=True):
+        mask = mask_of(sighting or reference, corner, normals)
+        faces = select_faces(crop, mask, GATE_SIGMAS * sigma_m, sigma_m)
+        if sighting is None:
+            faces = _trusted(faces, crop, mask_of(reference, corner, normals), sigma_m)
+        if not faces:
+            left_out.append(LeftOut(place.position, "no target where the other places put it"))
+        for j in range(3):
+            if faces and j not in faces:
+                left_out.append(LeftOut(f"{place.position}, face {j + 1}", "too few returns"))
+        places.append(CornerPlaceFaces(place.position, place.corner_world, faces, crop.frames))
+    return places, left_out
+
+
+def _trusted(faces: dict[int, FaceReturns], crop: PlaceCrop, mask: FaceMask, sigma_m: float) -> dict[int, FaceReturns]:
+    """At a place where no whole corner was seen: only faces on which most beams end where they should."""
+    anywhere, face = mask.select(crop.points, 0.5)
+    kept = {
+        j: f for j, f in faces.items() if len(f) > 0.6 * np.count_nonzero(face == j) and len(f) >= 3 * MIN_FACE_RETURNS
+    }
+    return kept if len(kept) >= 2 else {}

@@ -1,0 +1,313 @@
+"""The world job: from a corner session to the LiDAR's pose in the world, by the paper's methods and by one joint one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from lidarpose.detect.paper_corners import harris_corner, ransac_corner
+from lidarpose.errors import UndeterminedError
+from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.robust import box_plot_inliers
+from lidarpose.geometry.se3 import Pose
+from lidarpose.model.calibration import WorldCalibration
+from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
+from lidarpose.model.corner_session import CornerSession
+from lidarpose.model.observation import LeftOut
+from lidarpose.refine.corner_model import (
+    CornerFit,
+    CornerOptions,
+    CornerState,
+    estimate_world_sigma,
+    fit_corner_model,
+    frame_corners,
+)
+from lidarpose.refine.corner_verdict import CornerEvidence, cornerwise_covariance, judge_corner_fit, judge_corners
+from lidarpose.solve.corner_alignment import cayley_pose, pair_scale, svd_pose
+from lidarpose.solve.corner_matching import face_order
+from lidarpose.workflows.corner_target import (
+    FoundTarget,
+    PlaceCrop,
+    PlaceFit,
+    Tick,
+    find_target,
+    fit_place,
+    gather,
+    observe,
+)
+
+WorldMethod = Literal["joint", "paper", "paper-approx", "ransac", "harris"]
+WORLD_METHODS: tuple[WorldMethod, ...] = ("joint", "paper", "paper-approx", "ransac", "harris")
+
+# Frames whose corner is this far out are of another scene: someone walked by, the target was being moved.
+JOINT_WHISKER = 3.0
+MIN_FRAMES_FOR_BOX_PLOT = 5
+# Twice the gain in log likelihood at which uncertain world coordinates are believed in.
+CONVINCING_GAIN = 9.0
+
+
+def calibrate_world(
+    session: CornerSession,
+    method: WorldMethod = "joint",
+    *,
+    estimate_scale: bool | None = None,
+    seed: int = 0,
+    tick: Tick = lambda: None,
+) -> WorldCalibration:
+    """The pose of the clouds' frame in the world.
+
+    Parameters
+    ----------
+    session
+        Places with known world coordinates and the frames recorded at each.
+    method
+        `joint`, one maximum-likelihood estimate of everything; `paper`, corners of each frame's RANSAC planes, box plot
+        and mean over frames, Cayley's form iterated and then singular values; `paper-approx`, the same before that
+        optimisation; `ransac`, plain RANSAC planes of single frames; `harris`, 3D Harris corners.
+    estimate_scale
+        Also estimate the factor of eq. (2); by default what the session says.
+    tick
+        Called once for each frame read or searched.
+
+    Raises
+    ------
+    InputError
+        If a cloud cannot be read.
+    UndeterminedError
+        If the data determine no pose.
+    """
+    scale_too = session.estimate_scale if estimate_scale is None else estimate_scale
+    session = replace(session, estimate_scale=scale_too)
+    found = find_target(session, seed=seed, tick=tick)
+    if found.ambiguous:
+        raise UndeterminedError(
+            "more than one corner of the scene moves as the world coordinates say",
+            remedy="Tell which is the target's by near_x_m,near_y_m,near_z_m in the table of positions.",
+        )
+    crops = gather(session, found, tick=tick)
+    if method == "joint":
+        return _joint(session, found, crops, scale_too)
+    return _cornerwise(session, found, crops, method, scale_too, seed)
+
+
+def _usable_world(session: CornerSession, found: FoundTarget) -> CornerSession:
+    """The session with the world coordinates under which its corners fit."""
+    places = tuple(replace(p, corner_world=w) for p, w in zip(session.places, found.world, strict=True))
+    return replace(session, places=places)
+
+
+def _joint(session: CornerSession, found: FoundTarget, crops: Sequence[PlaceCrop], scale_too: bool) -> WorldCalibration:
+    mended = _usable_world(session, found)
+    fits = _place_fits(session, found, crops)
+    start, sigma_m = _start(mended, fits)
+    corners = _corners(start, fits, found)
+    places, left_out = observe(mended, found, crops, corners, start.normals, sigma_m)
+    places, frame_scatter, dropped = _without_odd_frames(places, corners, start.normals, sigma_m)
+    fit, used = _fit(mended, places, start, sigma_m, scale_too)
+    # Once more with the faces' beams selected by the estimate itself.
+    corners = fit.state.corners(found.world)
+    places, left_out = observe(mended, found, crops, corners, fit.state.normals, fit.range_sigma_m)
+    places, frame_scatter, dropped = _without_odd_frames(places, corners, fit.state.normals, fit.range_sigma_m)
+    fit, used = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too)
+    left_out += [LeftOut(f"{name}: {n} frames", "their corner is far from the others'") for name, n in dropped.items()]
+    evidence = CornerEvidence(
+        tuple(p.position for p in used),
+        tuple(left_out),
+        found.oddity,
+        session.world_sigma_m,
+        session.lidar.range_sigma_m,
+        session.cloud_frame,
+        frame_scatter,
+    )
+    quality = judge_corner_fit(fit, used, evidence)
+    return WorldCalibration(
+        fit.state.T_world_lidar,
+        session.cloud_frame,
+        fit.state.scale,
+        _as_used(fit.pose_covariance, quality.figures),
+        fit.names,
+        _as_used(fit.covariance, quality.figures),
+        quality,
+        _provenance(session, "joint"),
+    )
+
+
+def _as_used(covariance: FloatArray, figures: Mapping[str, Any]) -> FloatArray:
+    """The covariance, widened where returns of one spot err together."""
+    return np.asarray(covariance * float(figures.get("covariance_factor", 1.0)))
+
+
+def _provenance(session: CornerSession, method: str) -> dict[str, Any]:
+    from lidarpose import __version__
+
+    frames = sum(len(p.clouds) for p in session.places)
+    return {
+        "software": f"lidarpose {__version__}",
+        "session": session.name,
+        "method": method,
+        "places": len(session.places),
+        "frames": frames,
+    }
+
+
+def _place_fits(session: CornerSession, found: FoundTarget, crops: Sequence[PlaceCrop]) -> list[PlaceFit | None]:
+    first_guess = session.lidar.range_sigma_m
+    return [
+        None if s is None else fit_place(crop, s, first_guess or 2.0 * s.sigma_m)
+        for s, crop in zip(found.sightings, crops, strict=True)
+    ]
+
+
+def _start(session: CornerSession, fits: Sequence[PlaceFit | None]) -> tuple[CornerState, float]:
+    """The closed form on the corners of the places that stand by themselves."""
+    known = [(p, f) for p, f in zip(session.places, fits, strict=True) if f is not None]
+    if len(known) < 3:
+        raise UndeterminedError(
+            f"only {len(known)} places show three faces well enough to fit",
+            remedy="Bring the target nearer, or turn it so that several scan lines cross each face.",
+        )
+    world = np.stack([p.corner_world for p, _ in known])
+    lidar = np.stack([f.corner for _, f in known])
+    reference = known[0][1].normals
+    aligned = np.stack([f.normals[list(face_order(f.normals, reference)[0])] for _, f in known])
+    normals = np.median(aligned, axis=0)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    sigma_m = float(np.median([f.sigma_m for _, f in known]))
+    errors = np.zeros((len(session.places), 3))
+    return CornerState(svd_pose(world, lidar), normals, 1.0, errors), sigma_m
+
+
+def _corners(start: CornerState, fits: Sequence[PlaceFit | None], found: FoundTarget) -> FloatArray:
+    predicted = start.corners(found.world)
+    return np.stack([p if f is None else f.corner for f, p in zip(fits, predicted, strict=True)])
+
+
+def _without_odd_frames(
+    places: Sequence[CornerPlaceFaces], corners: FloatArray, normals: FloatArray, sigma_m: float
+) -> tuple[list[CornerPlaceFaces], dict[str, FloatArray], dict[str, int]]:
+    """Leave out frames whose corner is far from the others', coordinate by coordinate (the paper's box plot)."""
+    kept, scatter, dropped = [], {}, {}
+    for place, corner in zip(places, corners, strict=True):
+        if len(place.faces) == 3 and place.frames >= MIN_FRAMES_FOR_BOX_PLOT:
+            by_frame = frame_corners(place.faces, normals, corner, place.frames, sigma_m)
+            known = np.isfinite(by_frame).all(axis=1)
+            good = np.ones(place.frames, dtype=bool)
+            if known.sum() >= MIN_FRAMES_FOR_BOX_PLOT:
+                inside = [box_plot_inliers(by_frame[known, k], JOINT_WHISKER) for k in range(3)]
+                good[known] = np.all(inside, axis=0)
+                scatter[place.position] = by_frame[good & known].std(axis=0, ddof=1)
+            if not good.all():
+                dropped[place.position] = int(np.count_nonzero(~good))
+                faces = {j: _frames_only(f, good) for j, f in place.faces.items()}
+                place = replace(place, faces=faces)
+        kept.append(place)
+    return kept, scatter, dropped
+
+
+def _frames_only(returns: FaceReturns, good: Any) -> FaceReturns:
+    keep = good[returns.frame]
+    return FaceReturns(returns.directions[keep], returns.range_m[keep], returns.frame[keep])
+
+
+def _fit(
+    session: CornerSession, places: Sequence[CornerPlaceFaces], start: CornerState, sigma_m: float, scale_too: bool
+) -> tuple[CornerFit, list[CornerPlaceFaces]]:
+    """The joint estimate over the places that have faces; the world's noise as stated, or as the data show it."""
+    rows = [i for i, p in enumerate(places) if p.faces]
+    used = [places[i] for i in rows]
+    start = replace(start, world_errors=np.zeros((len(used), 3)))
+    stated = session.world_sigma_m
+    fit = fit_corner_model(used, start, sigma_m, CornerOptions(stated or 0.0, scale_too))
+    if stated is None:
+        estimated, gain = estimate_world_sigma(used, fit)
+        if gain > CONVINCING_GAIN:
+            fit = fit_corner_model(used, fit.state, fit.range_sigma_m, CornerOptions(estimated, scale_too))
+    return fit, used
+
+
+# ---- the paper's methods: a corner for each frame, a mean for each place, a closed form for the pose ----
+
+
+@dataclass(frozen=True, eq=False)
+class _PlaceMean:
+    position: str
+    corner: FloatArray
+    scatter: FloatArray
+    frames: int
+
+
+def _cornerwise(
+    session: CornerSession,
+    found: FoundTarget,
+    crops: Sequence[PlaceCrop],
+    method: WorldMethod,
+    scale_too: bool,
+    seed: int,
+) -> WorldCalibration:
+    means: list[_PlaceMean] = []
+    world = []
+    left_out = []
+    for place, sighting, crop, w in zip(session.places, found.sightings, crops, found.world, strict=True):
+        mean = None if sighting is None else _mean_corner(place.position, sighting, crop, method, seed)
+        if mean is None:
+            left_out.append(LeftOut(place.position, "no frame gave a corner"))
+            continue
+        means.append(mean)
+        world.append(w)
+    if len(means) < 3:
+        raise UndeterminedError(
+            f"the method {method} finds the corner at {len(means)} places; at least three are needed",
+            remedy="Use the method joint, or bring the target nearer.",
+        )
+    w, p = np.stack(world), np.stack([m.corner for m in means])
+    scale = pair_scale(w, p) if scale_too else 1.0
+    pose = _closed_form(method, w, p, scale)
+    covariance = cornerwise_covariance(pose, w, scale * p, np.stack([m.scatter / np.sqrt(m.frames) for m in means]))
+    evidence = CornerEvidence(
+        tuple(m.position for m in means),
+        tuple(left_out),
+        found.oddity,
+        session.world_sigma_m,
+        session.lidar.range_sigma_m,
+        session.cloud_frame,
+        {m.position: m.scatter for m in means},
+    )
+    quality = judge_corners(pose, w, scale * p, covariance, evidence)
+    return WorldCalibration(
+        pose, session.cloud_frame, scale, covariance, quality=quality, provenance=_provenance(session, method)
+    )
+
+
+def _closed_form(method: WorldMethod, world: FloatArray, lidar: FloatArray, scale: float) -> Pose:
+    if method == "paper":
+        approximate = cayley_pose(world, lidar, iterations=3, scale=scale)
+        turned = approximate @ (scale * lidar)
+        return svd_pose(world, turned) @ approximate
+    return cayley_pose(world, lidar, scale=scale)
+
+
+def _mean_corner(
+    position: str, sighting: CornerCandidate, crop: PlaceCrop, method: WorldMethod, seed: int
+) -> _PlaceMean | None:
+    """The corner of each frame, those outside the box plot left out, and the mean (section 3.1)."""
+    by_frame = []
+    for k in range(crop.frames):
+        points = crop.points[crop.frame == k]
+        if method == "harris":
+            corner = harris_corner(points, sighting.corner)
+        else:
+            corner = ransac_corner(points, sighting, seed=seed + k, screening=method != "ransac")
+        if corner is not None:
+            by_frame.append(corner)
+        if method in ("ransac", "harris") and corner is not None:
+            break
+    if not by_frame:
+        return None
+    corners = np.stack(by_frame)
+    if len(corners) >= MIN_FRAMES_FOR_BOX_PLOT:
+        corners = corners[np.all([box_plot_inliers(corners[:, k]) for k in range(3)], axis=0)]
+    scatter = corners.std(axis=0, ddof=1) if len(corners) > 2 else np.full(3, 0.005)
+    return _PlaceMean(position, corners.mean(axis=0), scatter, len(corners))
