@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lidarpose.errors import UndeterminedError
-from lidarpose.geometry.arrays import BoolArray, FloatArray, perpendicular_pair, unit
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, perpendicular_pair, unit
 from lidarpose.geometry.robust import mad_sigma
 from lidarpose.geometry.se3 import Pose, exp_so3, skew
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
@@ -53,7 +53,7 @@ class FaceSystem:
 
 @dataclass(frozen=True, eq=False)
 class CornerState:
-    """The unknowns: T_world_lidar, normals (3, 3) in the LiDAR frame, scale, and the world coordinates' errors (P, 3)."""
+    """The unknowns: pose, normals (3, 3) in the LiDAR frame, scale, and the world coordinates' errors (P, 3)."""
 
     T_world_lidar: Pose
     normals: FloatArray
@@ -123,7 +123,7 @@ def face_residuals(returns: FaceReturns, normal: FloatArray, corner: FloatArray)
     return np.asarray(returns.range_m - (normal @ corner) / (returns.directions @ normal))
 
 
-def direction_cells(directions: FloatArray, cell_rad: float) -> FloatArray:
+def direction_cells(directions: FloatArray, cell_rad: float) -> IntArray:
     """Which cell (N,) of a grid of angles about the bundle's middle each direction (N, 3) falls in, counted from 0."""
     mean = directions.mean(axis=0)
     local = directions @ np.linalg.svd(mean[None])[2].T
@@ -132,7 +132,7 @@ def direction_cells(directions: FloatArray, cell_rad: float) -> FloatArray:
     grid = np.floor(angles / cell_rad).astype(np.int64)
     grid -= grid.min(axis=0)
     flat = grid[:, 0] * (int(grid[:, 1].max()) + 1) + grid[:, 1]
-    return np.unique(flat, return_inverse=True)[1].ravel()
+    return np.asarray(np.unique(flat, return_inverse=True)[1].ravel(), dtype=np.int64)
 
 
 def _rows(directions: FloatArray, normal: FloatArray, corner: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -160,6 +160,11 @@ def _system(face: _Face, normal: FloatArray, corner: FloatArray, sigma_m: float)
     return FaceSystem(weighted.T @ rows, weighted.T @ face.residual, float(weight.sum()))
 
 
+def _wide_enough(sigma_m: float, residuals: Sequence[FloatArray]) -> float:
+    """A first scale under which a poor start loses no face: the loss narrows as the fit improves."""
+    return max(sigma_m, MIN_SIGMA_M, *(mad_sigma(r, centred=True) for r in residuals))
+
+
 def fit_corner(
     faces: Mapping[int, FaceReturns], normals: FloatArray, corner: FloatArray, sigma_m: float
 ) -> tuple[FloatArray, FloatArray, float]:
@@ -177,6 +182,8 @@ def fit_corner(
     UndeterminedError
         If a face's returns do not determine its plane.
     """
+    first = [face_residuals(faces[j], normals[j], corner) for j in range(3)]
+    sigma_m = _wide_enough(sigma_m, first)
     for _ in range(MAX_STEPS):
         residuals, moves = [], []
         for j in range(3):
@@ -232,6 +239,9 @@ def fit_corner_model(
         if len(f) >= MIN_RETURNS
     ]
     names = parameter_names([p.position for p in places], options)
+    corners = start.corners(world)
+    first = [face_residuals(places[f.place].faces[f.face], start.normals[f.face], corners[f.place]) for f in faces]
+    sigma_m = _wide_enough(sigma_m, first)
     state, step = start, 0
     for step in range(1, MAX_STEPS + 1):
         information, gradient, systems = _assemble(faces, state, world, sigma_m, options)
@@ -380,16 +390,16 @@ def frame_corners(
     return corners
 
 
-def place_discrepancies(fit: CornerFit) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+def place_discrepancies(fit: CornerFit) -> tuple[FloatArray, FloatArray, BoolArray]:
     """How each place by itself would move and turn the target against the joint estimate.
 
     Returns
     -------
-    (P, 6) shift in metres and turn in radians in the LiDAR frame; their covariances (P, 6, 6); the probability-free
-    statistic (P,) of each turn (three degrees of freedom); and which places (P,) determine all six numbers.
+    Shift (m) and turn (rad) in the LiDAR frame (P, 6); the turn's chi-square statistic (P,), of three degrees
+    of freedom; and which places (P,) determine all six numbers.
     """
     count = len(fit.world)
-    moves, covariances = np.zeros((count, 6)), np.tile(np.eye(6), (count, 1, 1))
+    moves = np.zeros((count, 6))
     statistic, known = np.zeros(count), np.zeros(count, dtype=bool)
     for i in range(count):
         H, g = np.zeros((6, 6)), np.zeros(6)
@@ -406,11 +416,11 @@ def place_discrepancies(fit: CornerFit) -> tuple[FloatArray, FloatArray, FloatAr
         scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
         if np.linalg.eigvalsh(H / np.outer(scale, scale))[0] < 1e-6:
             continue
-        covariances[i] = np.linalg.inv(H)
-        moves[i] = covariances[i] @ g
-        statistic[i] = float(moves[i, 3:] @ np.linalg.solve(covariances[i, 3:, 3:], moves[i, 3:]))
+        covariance = np.linalg.inv(H)
+        moves[i] = covariance @ g
+        statistic[i] = float(moves[i, 3:] @ np.linalg.solve(covariance[3:, 3:], moves[i, 3:]))
         known[i] = True
-    return moves, covariances, statistic, known
+    return moves, statistic, known
 
 
 def estimate_world_sigma(places: Sequence[CornerPlaceFaces], fit: CornerFit) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.se3 import Pose, UncertainPose, nearest_rotation, skew
 from lidarpose.model.calibration import Quality, Verdict
 from lidarpose.model.corner_result import CornerPlaceFaces
@@ -62,7 +62,7 @@ def judge_corner_fit(fit: CornerFit, places: Sequence[CornerPlaceFaces], evidenc
     verdict = _Verdict()
     factor = _common_error_factor(fit, places)
     corners = fit.state.corners(fit.world)
-    moves, covariances, statistic, known = place_discrepancies(fit)
+    moves, statistic, known = place_discrepancies(fit)
     figures = _figures(fit.state.T_world_lidar, fit.pose_covariance * factor, evidence)
     figures |= {
         "range_sigma_mm": 1e3 * fit.range_sigma_m,
@@ -193,7 +193,7 @@ def _judge_turns(
     places: Sequence[CornerPlaceFaces],
     moves: FloatArray,
     statistic: FloatArray,
-    known: FloatArray,
+    known: BoolArray,
 ) -> None:
     if not known.any():
         return
@@ -268,7 +268,7 @@ def _rms(rows: FloatArray) -> float:
 def cornerwise_covariance(T_world_lidar: Pose, world: FloatArray, lidar: FloatArray, sigma: FloatArray) -> FloatArray:
     """Covariance (6, 6) of a least-squares pose from corners (P, 3) of standard deviations `sigma` (P, 3).
 
-    The corners' own scatter, or what they miss the world by, whichever is larger: a mean's scatter says nothing of bias.
+    The corners' own scatter, or what they miss the world by, if larger: a mean's scatter says nothing of bias.
     """
     rows = np.concatenate([np.hstack([np.eye(3), -skew(p)]) for p in T_world_lidar @ lidar])
     inverse = np.linalg.inv(rows.T @ rows)

@@ -215,7 +215,7 @@ def gather(session: CornerSession, found: FoundTarget, *, tick: Tick = lambda: N
         offset = points - corner.astype(points.dtype)
         kept = points[np.einsum("ij,ij->i", offset, offset) < radius * radius]
         tick()
-        return kept.astype(np.float64)
+        return np.asarray(kept, dtype=np.float64)
 
     crops = []
     with ThreadPoolExecutor(2) as pool:
@@ -337,16 +337,15 @@ def observe(
             faces = _trusted(faces, crop, mask_of(reference, corner, normals), sigma_m)
         if not faces:
             left_out.append(LeftOut(place.position, "no target where the other places put it"))
-        for j in range(3):
-            if faces and j not in faces:
-                left_out.append(LeftOut(f"{place.position}, face {j + 1}", "too few returns"))
+        missing = [j for j in range(3) if faces and j not in faces]
+        left_out += [LeftOut(f"{place.position}, face {j + 1}", "too few returns") for j in missing]
         places.append(CornerPlaceFaces(place.position, place.corner_world, faces, crop.frames))
     return places, left_out
 
 
 def _trusted(faces: dict[int, FaceReturns], crop: PlaceCrop, mask: FaceMask, sigma_m: float) -> dict[int, FaceReturns]:
     """At a place where no whole corner was seen: only faces on which most beams end where they should."""
-    anywhere, face = mask.select(crop.points, 0.5)
+    _, face = mask.select(crop.points, 0.5)
     kept = {
         j: f for j, f in faces.items() if len(f) > 0.6 * np.count_nonzero(face == j) and len(f) >= 3 * MIN_FACE_RETURNS
     }

@@ -1,4 +1,4 @@
-"""The world job: from a corner session to the LiDAR's pose in the world, by the paper's methods and by one joint one."""
+"""The world job: from a corner session to the pose in the world, by the paper's methods and by one joint estimate."""
 
 from __future__ import annotations
 
