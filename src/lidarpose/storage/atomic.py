@@ -78,6 +78,19 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         raise InputError(path, f"cannot be written: {error.strerror or error}") from error
 
 
+def require_new_folder(path: Path) -> None:
+    """InputError if something stands at `path` already, an empty folder excepted."""
+    restore_folder(Path(path))
+    try:
+        taken = path.exists() and not (path.is_dir() and not any(path.iterdir()))
+    except OSError as error:
+        raise InputError(path, f"cannot be read: {error.strerror or error}") from error
+    if taken:
+        raise InputError(
+            path, "exists already", expected="a new folder", remedy="Name another folder, or remove this one."
+        )
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file, whole or not at all."""
     with replacing(path) as temporary:

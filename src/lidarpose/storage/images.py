@@ -12,6 +12,7 @@ from lidarpose.errors import InputError
 from lidarpose.model.image import GrayImage
 
 MAX_IMAGE_BYTES = 512 * 2**20
+MAX_PIXELS = 2**26
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -58,6 +59,21 @@ class FileImage:
                 expected=f"{self.width} x {self.height}, the size in the camera's file",
                 remedy="Use raw images of the calibrated camera, neither scaled nor cropped.",
             )
+
+
+def decode_image(path: Path, data: bytes, *, where: str | None = None) -> GrayImage:
+    """Decode the bytes of an image file that stands inside another one, such as a bag.
+
+    Raises
+    ------
+    InputError
+        If the bytes are no whole image, of a kind whose size is not known beforehand, or of too many pixels.
+    """
+    size = png_size(path, data) if data.startswith(_PNG) else other_size(data)
+    if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
+        found = "is of no known kind" if size is None else f"has {size[0]} x {size[1]} pixels"
+        raise InputError(path, f"an image {found}", field=where, expected="PNG, JPEG or BMP of at most 2^26 pixels")
+    return _decode(path, data)
 
 
 def _read_bytes(path: Path) -> bytes:

@@ -54,7 +54,7 @@ def read(path: Path) -> Cloud:
         cloud = _read_binary(path, header, available)
     else:
         cloud = cloud_of_rows(_read_compressed(path, header, available), path, skip=header.padding)
-    return _unpack_colours(cloud)
+    return unpack_colours(cloud)
 
 
 def _read_header(path: Path) -> _Header:
@@ -181,7 +181,7 @@ def _require_padding(path: Path, end: int) -> None:
     raise InputError(path, f"has {extra} bytes more than its points take", field="POINTS", expected="the points alone")
 
 
-def _unpack_colours(cloud: Cloud) -> Cloud:
+def unpack_colours(cloud: Cloud) -> Cloud:
     """``rgb`` or ``rgba``, 0xAARRGGBB packed in four bytes, as red, green and blue."""
     for name in ("rgb", "rgba"):
         packed = cloud.fields.get(name)
