@@ -394,6 +394,7 @@ class _ImageReader:
         with self._lock:
             if index not in self._passed:
                 self._advance(index)
+            self.wanted.discard(index)
             return self._passed.pop(index)
 
     def _advance(self, index: int) -> None:
