@@ -86,3 +86,27 @@ class UndeterminedError(LidarposeError):
 
 def _rebuild_undetermined_error(what: str, remedy: str, details: tuple[str, ...]) -> UndeterminedError:
     return UndeterminedError(what, remedy=remedy, details=details)
+
+
+class RejectedError(UndeterminedError):
+    """An estimate was made, and its own tests say that it must not be used (exit status 1).
+
+    Parameters
+    ----------
+    what
+        What is rejected.
+    reasons
+        Each with what to do about it.
+    """
+
+    def __init__(self, what: str, *, reasons: tuple[str, ...]) -> None:
+        first = reasons[0] if reasons else "see the report"
+        super().__init__(what, remedy=f"Do not use it: {first}", details=reasons[1:])
+        self.reasons = reasons
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuild_rejected_error, (self.what, self.reasons)
+
+
+def _rebuild_rejected_error(what: str, reasons: tuple[str, ...]) -> RejectedError:
+    return RejectedError(what, reasons=reasons)

@@ -98,6 +98,10 @@ FLAWS = {
     "no board images": (lambda f: (f / "board/0.png").unlink(), "board.images: no image matches"),
     "missing stripe image": (lambda f: (f / "stripes/001.png").unlink(), "line 3: stripe_image: names"),
     "missing scan": (lambda f: (f / "scans/002.csv").unlink(), "line 4: scan: names"),
+    "two files missing": (
+        lambda f: [(f / f"scans/00{k}.csv").unlink() for k in (1, 2)],
+        "2 of 5 files are missing: scans/001.csv (line 3), scans/002.csv (line 4)",
+    ),
     "file outside": (
         lambda f: replace(f / "positions.csv", "scans/002", "../scans/002"),
         "inside the session's folder",

@@ -17,6 +17,7 @@ EXIT_INTERRUPTED = 130
 
 # Commands are named as text, so that `lidarpose --help` imports none of them.
 _COMMANDS: dict[str, tuple[str, str]] = {
+    "calibrate": ("lidarpose.cli.calibrate:calibrate", "Find the LiDAR's pose from a session."),
     "scan": ("lidarpose.cli.scan:scan", "Turn a sweep recording into a 3D cloud."),
     "import": ("lidarpose.cli.import_bag:import_bag", "Make a recording or session of a ROS bag or of packets."),
     "export": ("lidarpose.cli.export:export", "Write a calibration for ROS 2, URDF, Kalibr, OpenCV, or as CSV."),

@@ -216,6 +216,25 @@ def _transform(path: Path, file: _CalibrationFile, parent: str, child: str) -> t
     return pose, _covariance(path, f"{field}.covariance", entry.covariance)
 
 
+def transform_from(path: Path, entries: list[Any], parent: str, child: str) -> Pose | None:
+    """One transform out of a list as calibration files hold it; None if it is not among them.
+
+    Raises
+    ------
+    InputError
+        If an entry is no transform, or no rigid motion.
+    """
+    for index, document in enumerate(entries):
+        entry = parse(path, _TransformEntry, document)
+        if (entry.parent, entry.child) == (parent, child):
+            try:
+                return _pose(entry)
+            except ValueError as error:
+                field = f"transforms.{index}"
+                raise InputError(path, str(error), field=field, expected="a rigid motion") from error
+    return None
+
+
 def _pose(entry: _TransformEntry) -> Pose:
     from_matrix = None if entry.matrix is None else Pose.from_matrix(entry.matrix)
     if entry.quaternion_xyzw is None or entry.translation_m is None:

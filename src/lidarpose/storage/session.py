@@ -107,6 +107,30 @@ def read_turntable_session(folder: Path, *, any_order: bool = False) -> Turntabl
     return TurntableSession(str(folder), camera, panels, board_images, places, document.lidar.spec())
 
 
+def session_format(folder: Path) -> str:
+    """What kind of session a folder holds: the `format` of its session.toml. Raises InputError if it has none."""
+    file = folder / "session.toml"
+    if not folder.is_dir():
+        raise InputError(
+            folder, "is missing" if not folder.exists() else "is not a folder", expected="a session's folder"
+        )
+    found = read_toml(file).get("format")
+    if not isinstance(found, str):
+        raise InputError(file, "is missing", field="format", expected=f'"{SESSION_FORMAT}" or another session format')
+    return found
+
+
+def session_files(folder: Path, session: TurntableSession) -> list[Path]:
+    """All files that a session read from a folder stands on."""
+    document = parse(folder / "session.toml", _SessionFile, read_toml(folder / "session.toml"))
+    files = [folder / "session.toml", folder / document.camera, folder / document.positions]
+    sources = [source for shots in session.board_images.values() for source in shots]
+    sources += [place.stripe_image for place in session.places if place.stripe_image is not None]
+    files += [source.path for source in sources if isinstance(source, FileImage)]
+    files += [place.scan.path for place in session.places if isinstance(place.scan, FileScan)]
+    return files
+
+
 def _panel(file: Path, index: int, section: _PanelSection) -> Panel:
     if max(section.columns, section.rows) * section.square_m > 20.0:
         raise InputError(
@@ -169,9 +193,31 @@ def _read_positions(folder: Path, path: Path, camera: Camera, any_order: bool) -
         raise InputError(path, f"has {len(table.rows)} rows", expected=f"at most {MAX_PLACES}")
     _check_unique(table, "position")
     _check_unique(table, "scan")
+    _check_files(folder, table)
     angles = np.array([table.number(k, "turntable_angle_deg") for k in range(len(table.rows))])
     _check_angles(table, angles, any_order)
     return tuple(_place(folder, table, k, float(np.deg2rad(a)), camera) for k, a in enumerate(angles))
+
+
+def _check_files(folder: Path, table: TextTable) -> None:
+    """Name every missing file at once: nobody wants to learn of them one by one."""
+    named = [
+        (line, column, cells[column])
+        for cells, line in zip(table.rows, table.lines, strict=True)
+        for column in ("stripe_image", "scan")
+        if cells[column]
+    ]
+    missing = [entry for entry in named if not (folder / entry[2]).is_file()]
+    if len(missing) > 1:
+        shown = ", ".join(f"{name} (line {line})" for line, _, name in missing[:5])
+        more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
+        raise InputError(
+            table.path,
+            f"{len(missing)} of {len(named)} files are missing: {shown}{more}",
+            field="/".join(dict.fromkeys(column for _, column, _ in missing)),
+            expected="every file named to be in the session's folder",
+            remedy="Put the files in their places, or take their rows out.",
+        )
 
 
 def _place(folder: Path, table: TextTable, row: int, angle_rad: float, camera: Camera) -> TurntablePlace:

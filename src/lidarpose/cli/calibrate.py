@@ -1,0 +1,163 @@
+"""``lidarpose calibrate``: a session becomes a calibration file and a report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from lidarpose.cli.options import Json, PositiveFloat, Quiet
+from lidarpose.errors import InputError, RejectedError
+
+if TYPE_CHECKING:
+    from lidarpose.model.calibration import Quality
+    from lidarpose.model.turntable_run import TruthError, TurntableRun
+
+Methods = Literal["joint", "paper", "paper-approx", "ransac", "harris"]
+Extra = Literal["range-offset", "range-scale", "black-bias", "beam-angle-scale", "encoder-scale", "focal-scale"]
+_IN_METRES = ("range-offset", "black-bias")
+
+
+def calibrate(
+    session: Path,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    method: Methods = "joint",
+    first_panel: Annotated[Literal[1, 2] | None, Parameter(group="Turntable sessions")] = None,
+    estimate: Annotated[tuple[Extra, ...], Parameter(negative=(), group="Turntable sessions")] = (),
+    any_order: Annotated[bool, Parameter(negative=(), show_default=False, group="Turntable sessions")] = False,
+    estimate_scale: Annotated[bool, Parameter(negative=(), show_default=False, group="Corner sessions")] = False,
+    want_mm: PositiveFloat | None = None,
+    want_deg: PositiveFloat | None = None,
+    report: Annotated[bool, Parameter(negative="--no-report", show_default=False)] = True,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Find the LiDAR's pose from a session: DIR/calibration.json and DIR/report.html.
+
+    The kind of session, turntable or corner, is told by its session.toml.
+
+    Parameters
+    ----------
+    session
+        The session's folder.
+    output
+        The folder for the results; made if it is not there.
+    method
+        joint: one maximum-likelihood estimate with its covariance and a verdict. paper: the closed forms of the paper
+        that the session's kind comes from. paper-approx, ransac, harris: the corner paper's other rows.
+    first_panel
+        The panel (1 or 2, in the session's order) on which the scan line of smaller beam angle lies. Needed only
+        where the data cannot tell.
+    estimate
+        Further parameters of the instrument to estimate; each is tested for being observable first.
+    any_order
+        Accept turntable readings that are equal or go back and forth.
+    estimate_scale
+        Estimate the scale between the LiDAR's metres and the world's.
+    want_mm
+        Standard deviation of the LiDAR's centre that is good enough, in mm.
+    want_deg
+        Standard deviation of its orientation that is good enough, in degrees.
+    report
+        Write report.html too.
+    """
+    from lidarpose.storage.corner_session import CORNER_SESSION_FORMAT
+    from lidarpose.storage.session import SESSION_FORMAT, session_format
+
+    found = session_format(session)
+    if found == CORNER_SESSION_FORMAT:
+        _calibrate_corners(session, output, method, estimate_scale=estimate_scale, json=json, quiet=quiet)
+        return
+    if found != SESSION_FORMAT:
+        expected = f'"{SESSION_FORMAT}" or "{CORNER_SESSION_FORMAT}"'
+        raise InputError(session / "session.toml", f"is {found!r}", field="format", expected=expected)
+    if method not in ("joint", "paper"):
+        raise InputError("--method", f"{method!r} is for corner sessions", expected="joint or paper")
+    options = {
+        "method": method,
+        "first_panel": first_panel,
+        "estimate": list(estimate),
+        "any_order": any_order,
+        "want_mm": want_mm,
+        "want_deg": want_deg,
+    }
+    run = _calibrate_turntable(session, options, quiet=quiet or json)
+    _finish(run, session, output, with_report=report, json=json, quiet=quiet)
+
+
+def _calibrate_corners(
+    session: Path, output: Path, method: str, *, estimate_scale: bool, json: bool, quiet: bool
+) -> None:
+    from lidarpose.cli.calibrate_world import calibrate_world_session
+
+    calibration = calibrate_world_session(
+        session, output, method=method, estimate_scale=estimate_scale or None, json=json, quiet=quiet
+    )
+    _refuse_if_rejected(calibration.quality)
+
+
+def _refuse_if_rejected(quality: Quality | None) -> None:
+    """What was found is written and printed; a script that looks at the exit status alone must not go on."""
+    if quality is not None and quality.verdict == "rejected":
+        raise RejectedError("The calibration is rejected", reasons=quality.reasons)
+
+
+def _calibrate_turntable(folder: Path, options: dict[str, Any], *, quiet: bool) -> TurntableRun:
+    from lidarpose.cli.console import progress
+    from lidarpose.refine.turntable import JointOptions
+    from lidarpose.storage.provenance import provenance
+    from lidarpose.storage.session import read_turntable_session, session_files
+    from lidarpose.workflows.turntable import calibrate_turntable
+
+    session = read_turntable_session(folder, any_order=options["any_order"])
+    wishes = {k: options[k] for k in ("want_mm", "want_deg") if options[k] is not None}
+    first_panel = options["first_panel"]
+    with progress("images and scans", len(session.places), quiet=quiet) as advance:
+        return calibrate_turntable(
+            session,
+            method=options["method"],
+            first_panel=None if first_panel is None else first_panel - 1,
+            options=JointOptions(estimate=tuple(_parameter_name(extra) for extra in options["estimate"]), **wishes),
+            provenance=provenance("calibrate", folder, session_files(folder, session), options),
+            step=advance,
+        )
+
+
+def _parameter_name(extra: str) -> str:
+    return extra.replace("-", "_") + ("_m" if extra in _IN_METRES else "")
+
+
+def _finish(run: TurntableRun, folder: Path, output: Path, *, with_report: bool, json: bool, quiet: bool) -> None:
+    from lidarpose.cli.console import err, out, print_json
+    from lidarpose.cli.turntable_summary import print_summary, summary
+    from lidarpose.storage.calibration import write_calibration
+    from lidarpose.storage.truth import read_turntable_truth
+    from lidarpose.workflows.turntable import error_against_truth
+
+    truth = read_turntable_truth(folder)
+    error: TruthError | None = None
+    if truth is not None:
+        error = error_against_truth(
+            run.calibration.motion, truth, [place.turntable_angle_rad for place in run.session.places]
+        )
+    write_calibration(output / "calibration.json", run.calibration)
+    if with_report:
+        _write_report(run, output / "report.html", error)
+    if json:
+        print_json(summary(run, error))
+    else:
+        print_summary(out(), run, error, output)
+    if run.left_out and not (json or quiet):
+        err().print(f"{len(run.left_out)} features or places were left out; the report lists them with their reasons.")
+    _refuse_if_rejected(run.calibration.quality)
+
+
+def _write_report(run: TurntableRun, path: Path, error: TruthError | None) -> None:
+    from lidarpose.report.turntable_page import turntable_page
+    from lidarpose.storage.atomic import write_text
+
+    boards = {placement: sources[0].load() for placement, sources in run.session.board_images.items()}
+    write_text(path, turntable_page(run, boards, truth=error))

@@ -1,0 +1,254 @@
+"""The turntable job, from a session to a calibration; each function is a box of the paper's flow charts (1 and 5)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lidarpose.errors import UndeterminedError
+from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.se3 import Pose, log_so3
+from lidarpose.model.calibration import Quality, TurntableCalibration
+from lidarpose.model.observation import LeftOut, PlaceFeatures, StripePoints, TurntableObservations
+from lidarpose.model.session import TurntablePlace, TurntableSession
+from lidarpose.model.turntable import TurntableMotion
+from lidarpose.model.turntable_run import Deviation, FunctionDeviation, Method, TruthError, TurntableRun
+
+if TYPE_CHECKING:
+    from lidarpose.detect.chessboard import BoardDetection
+    from lidarpose.detect.laser_stripe import StripeFinder
+    from lidarpose.model.turntable_result import TurntableEstimate
+    from lidarpose.refine.turntable import JointOptions
+    from lidarpose.solve.paper import PaperSolution
+
+Step = Callable[[], None]
+"""Called after each image or scan that is done, for a progress bar."""
+
+
+@dataclass(frozen=True)
+class DetectedFeatures:
+    """What detection found in a session, before anything is assigned.
+
+    Attributes
+    ----------
+    boards
+        By placement.
+    places
+        In the session's order; the places that could not be used at all are missing.
+    left_out
+        With their reasons.
+    notes
+        What the user should know, in words.
+    """
+
+    boards: Mapping[str, BoardDetection]
+    places: tuple[PlaceFeatures, ...]
+    left_out: tuple[LeftOut, ...]
+    notes: tuple[str, ...]
+
+
+def calibrate_turntable(
+    session: TurntableSession,
+    *,
+    method: Method = "joint",
+    first_panel: int | None = None,
+    options: JointOptions | None = None,
+    provenance: Mapping[str, Any] | None = None,
+    step: Step | None = None,
+) -> TurntableRun:
+    """Find the LiDAR's pose in the camera frame as a function of the turntable's reading.
+
+    Parameters
+    ----------
+    session
+        Board images, stripe images and scans.
+    method
+        `joint`: one maximum-likelihood estimate over all places. `paper`: the closed forms of the turntable paper.
+    first_panel
+        The user's hint: the panel (0 or 1) on which the scan line of smaller beam angle lies.
+    options
+        Of the joint estimate.
+    step
+        Called after each place.
+
+    Raises
+    ------
+    InputError
+        If an image or scan cannot be read.
+    UndeterminedError
+        If the session does not determine the motion; the message says why, and what to record.
+    """
+    features = detect_features(session, step=step)
+    observations = assign_lines(session, features, first_panel=first_panel)
+    paper = solve(observations)
+    samples = {position: sample.pose for position, sample in paper.samples.items()}
+    estimate = None
+    if method == "joint":
+        estimate = refine(observations, paper, options, features)
+        calibration = estimate.calibration(provenance)
+        left_out = estimate.left_out
+    else:
+        calibration = TurntableCalibration(paper.motion, quality=paper_quality(paper), provenance=provenance or {})
+        left_out = paper.left_out
+    return TurntableRun(
+        method=method,
+        session=session,
+        observations=observations,
+        samples=samples,
+        paper_motion=paper.motion,
+        deviation=deviation_from_samples(calibration.motion, observations, samples),
+        calibration=calibration,
+        estimate=estimate,
+        left_out=merge_left_out(observations.left_out, left_out),
+        notes=features.notes,
+    )
+
+
+def detect_features(session: TurntableSession, *, step: Step | None = None) -> DetectedFeatures:
+    """Boards, stripes and scan lines of a session (sections 1.2 to 1.4), images decoded on all cores."""
+    boards, finders = {}, {}
+    for placement, sources in session.board_images.items():
+        boards[placement], finders[placement] = _detect_board(session, placement, [s.load() for s in sources])
+    places, left_out = [], []
+    for found, problems in _on_all_cores(lambda place: _detect_place(session, finders, place), session.places, step):
+        left_out += problems
+        if found is not None:
+            places.append(found)
+    notes = tuple(note for board in boards.values() for note in board.notes)
+    return DetectedFeatures(boards, tuple(places), tuple(left_out), notes)
+
+
+def _detect_board(
+    session: TurntableSession, placement: str, images: Sequence[Any]
+) -> tuple[BoardDetection, StripeFinder]:
+    from lidarpose.detect.chessboard import find_panels
+    from lidarpose.detect.laser_stripe import StripeFinder
+
+    try:
+        board = find_panels(images, session.panels)
+    except UndeterminedError as error:
+        names = ", ".join(source.name for source in session.board_images[placement][:3])
+        raise UndeterminedError(f"{error.what} ({names})", remedy=error.remedy, details=error.details) from None
+    return board, StripeFinder(board, images)
+
+
+def _detect_place(
+    session: TurntableSession, finders: Mapping[str, StripeFinder], place: TurntablePlace
+) -> tuple[PlaceFeatures | None, list[LeftOut]]:
+    """Stripes and straight scan lines of one place; None if nothing in it can be used."""
+    from lidarpose.detect.scan_lines import find_lines
+
+    problems: list[LeftOut] = []
+    stripes: Mapping[int, StripePoints] = {}
+    if place.stripe_image is not None:
+        detection = finders[place.placement].find(place.stripe_image.load())
+        stripes = detection.stripes
+        problems += [LeftOut(f"position {place.position}, {p.what}", p.reason) for p in detection.problems]
+    scan = place.scan.load()
+    lines = find_lines(scan, session.lidar) if scan.has_return.any() else ()
+    if not lines:
+        reason = "its scan has no straight line" if scan.has_return.any() else "no beam of its scan has a return"
+        return None, [*problems, LeftOut(f"position {place.position}", reason)]
+    return PlaceFeatures(place.position, place.turntable_angle_rad, stripes, lines, place.placement), problems
+
+
+def _on_all_cores(
+    work: Callable[[TurntablePlace], Any], places: Iterable[TurntablePlace], step: Step | None
+) -> list[Any]:
+    """Results in the order of the places, whatever thread made them. OpenCV and file reads run beside each other."""
+    executor = ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1))
+    results = []
+    try:
+        for result in executor.map(work, places):
+            results.append(result)
+            if step is not None:
+                step()
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+    return results
+
+
+def assign_lines(
+    session: TurntableSession, features: DetectedFeatures, *, first_panel: int | None = None
+) -> TurntableObservations:
+    """Decide by evidence which scan lines lie on which panels."""
+    from lidarpose.solve.assignment import assign
+    from lidarpose.solve.paper import board_poses
+
+    corners = {name: board.corners for name, board in features.boards.items()}
+    unassigned = TurntableObservations(session.camera, session.panels, corners, (), session.lidar, features.left_out)
+    panel_poses = {name: board_poses(session.camera, corners[name], name) for name in corners}
+    assignment = assign(session.camera, panel_poses, features.places, first_panel=first_panel)
+    left_out = merge_left_out(features.left_out, assignment.left_out)
+    return replace(unassigned, places=assignment.places, left_out=left_out)
+
+
+def solve(observations: TurntableObservations) -> PaperSolution:
+    """The paper's closed forms (its sections 1 and 2)."""
+    from lidarpose.solve.paper import solve_paper
+
+    return solve_paper(observations)
+
+
+def refine(
+    observations: TurntableObservations,
+    start: PaperSolution,
+    options: JointOptions | None,
+    features: DetectedFeatures,
+) -> TurntableEstimate:
+    """The joint estimate, started from the closed form."""
+    from lidarpose.refine.turntable import JointOptions, refine_turntable
+
+    poses = {name: tuple(p.T_camera_panel for p in panels) for name, panels in start.panel_poses.items()}
+    return refine_turntable(observations, start.motion, poses, options or JointOptions())
+
+
+def paper_quality(paper: PaperSolution) -> Quality:
+    """The paper's method states no uncertainty, so that nothing better than `doubtful` can be said of it."""
+    reason = (
+        "The paper's method states no uncertainty; deviations from its own samples are no error against the truth. "
+        "Use --method joint for a verdict."
+    )
+    return Quality("doubtful", (reason,), {"table_1": paper.deviations.table()})
+
+
+def deviation_from_samples(
+    motion: TurntableMotion, observations: TurntableObservations, samples: Mapping[str, Pose]
+) -> FunctionDeviation:
+    """Table 1 of the paper for any motion: its deviation from the single places' poses."""
+    from lidarpose.solve.turntable_function import deviations
+
+    readings = {place.position: place.turntable_angle_rad for place in observations.places}
+    found = deviations(motion, [readings[position] for position in samples], list(samples.values()))
+    return FunctionDeviation(
+        _deviation(1e3 * found.centre_m), _deviation(np.rad2deg(found.z_rad)), _deviation(np.rad2deg(found.x_rad))
+    )
+
+
+def error_against_truth(motion: TurntableMotion, truth: TurntableMotion, readings_rad: Sequence[float]) -> TruthError:
+    """How far a motion is from the true one, over the session's readings and over the whole turn."""
+    arc = [_pose_error(motion, truth, angle) for angle in np.linspace(min(readings_rad), max(readings_rad), 25)]
+    turn = [_pose_error(motion, truth, angle) for angle in np.arange(72) * (2.0 * np.pi / 72)]
+    columns = [1e3 * np.array(arc)[:, 0], np.rad2deg(np.array(arc)[:, 1])]
+    columns += [1e3 * np.array(turn)[:, 0], np.rad2deg(np.array(turn)[:, 1])]
+    return TruthError(*(_deviation(column) for column in columns))
+
+
+def _pose_error(motion: TurntableMotion, truth: TurntableMotion, angle: float) -> tuple[float, float]:
+    mine, true = motion.pose(angle), truth.pose(angle)
+    rotation = float(np.linalg.norm(log_so3(mine.rotation @ true.rotation.T)))
+    return float(np.linalg.norm(mine.translation - true.translation)), rotation
+
+
+def _deviation(values: FloatArray) -> Deviation:
+    return Deviation(float(np.mean(values)), float(np.max(values)))
+
+
+def merge_left_out(first: Iterable[LeftOut], second: Iterable[LeftOut]) -> tuple[LeftOut, ...]:
+    """Both lists, each entry once."""
+    return tuple(dict.fromkeys((*first, *second)))

@@ -1,0 +1,153 @@
+"""`calibrate` on simulated sessions, whole and spoilt."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarpose.cli.main import run
+from lidarpose.storage.calibration import read_turntable_calibration
+from lidarpose.storage.truth import read_turntable_truth
+from tests_support.sessions import PLACES, blank_images, copy_session, edit_text, hide_panel_stripe
+
+
+@pytest.mark.parametrize("method", ["paper", "joint"])
+def test_a_session_becomes_a_calibration(
+    simulated_session: Path, tmp_path: Path, method: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["calibrate", str(simulated_session), "-o", str(tmp_path), "--method", method, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["places"] == {"recorded": PLACES, "used": PLACES}
+    assert document["table_1"]["centre_mm"]["mean"] < 1.12
+    assert document["table_1"]["z_deg"]["mean"] < 0.203
+    assert document["table_1"]["x_deg"]["mean"] < 0.662
+    assert document["error_against_truth"]["arc"]["centre_mm"]["largest"] < 1.0
+    assert document["error_against_truth"]["arc"]["rotation_deg"]["largest"] < 0.1
+    calibration = read_turntable_calibration(tmp_path / "calibration.json")
+    assert "<html" in (tmp_path / "report.html").read_text()[:2000]
+    truth = read_turntable_truth(simulated_session)
+    assert truth is not None
+    metres, radians = calibration.pose(0.1).distance(truth.pose(0.1))
+    assert metres < 1e-3
+    assert np.rad2deg(radians) < 0.1
+    assert (calibration.parameter_covariance is not None) == (method == "joint")
+    assert calibration.quality is not None
+    assert calibration.quality.verdict == ("good" if method == "joint" else "doubtful")
+
+
+def test_people_get_a_table_and_the_verdict(
+    simulated_session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["calibrate", str(simulated_session), "-o", str(tmp_path), "--quiet"]) == 0
+    text = capsys.readouterr().out
+    assert "Table 1" in text
+    assert "verdict: good" in text
+    assert "error against truth" in text
+
+
+def test_the_same_input_gives_the_same_output(simulated_session: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        assert run(["calibrate", str(simulated_session), "-o", str(tmp_path / name), "--quiet"]) == 0
+    first, second = ((tmp_path / name / "calibration.json").read_bytes() for name in ("a", "b"))
+    assert first == second
+
+
+def keep_rows(session: Path, count: int) -> None:
+    edit_text(session / "positions.csv", lambda text: "\n".join(text.splitlines()[: count + 1]) + "\n")
+
+
+def empty_scan(session: Path) -> None:
+    path = session / "scans/002.csv"
+    lines = path.read_text().splitlines()
+    columns = lines[0].split(",")
+    rows = [line.split(",")[0] + "," * (len(columns) - 1) for line in lines[1:]]
+    path.write_text("\n".join([lines[0], *rows]) + "\n")
+
+
+def swap_rows(text: str) -> str:
+    lines = text.splitlines()
+    lines[2], lines[3] = lines[3], lines[2]
+    return "\n".join(lines) + "\n"
+
+
+def same_angle(text: str) -> str:
+    rows = [line.split(",") for line in text.splitlines()]
+    rows[3][1] = rows[2][1]
+    return "\n".join(",".join(row) for row in rows) + "\n"
+
+
+FLAWS: dict[str, tuple[Callable[[Path], object], int, str]] = {
+    "a missing image": (lambda s: (s / "stripes/001.png").unlink(), 2, "stripes/001.png"),
+    "a scan file of no bytes": (lambda s: (s / "scans/002.csv").write_bytes(b""), 2, "scans/002.csv: line 1: is empty"),
+    "a truncated image": (
+        lambda s: (s / "stripes/001.png").write_bytes((s / "stripes/001.png").read_bytes()[:2000]),
+        2,
+        "001.png: is cut off",
+    ),
+    "a wrong board size": (
+        lambda s: edit_text(s / "session.toml", lambda t: t.replace("columns = 20", "columns = 17")),
+        1,
+        "17 x",
+    ),
+    "two equal angles": (lambda s: edit_text(s / "positions.csv", same_angle), 2, "turntable_angle_deg"),
+    "angles out of order": (lambda s: edit_text(s / "positions.csv", swap_rows), 2, "--any-order"),
+    "only two places": (lambda s: keep_rows(s, 2), 1, "three"),
+    "no stripe": (lambda s: blank_images(sorted((s / "stripes").glob("*.png"))), 1, "stripe"),
+    "a stripe on one panel": (
+        lambda s: [hide_panel_stripe(p, s / "board/00.png", left=True) for p in sorted((s / "stripes").glob("*.png"))],
+        1,
+        "panel",
+    ),
+}
+
+
+@pytest.mark.parametrize("flaw", FLAWS)
+def test_each_flaw_has_its_status_and_a_message(
+    simulated_session: Path, tmp_path: Path, flaw: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = copy_session(simulated_session, tmp_path / "session")
+    spoil, status, message = FLAWS[flaw]
+    spoil(session)
+    assert run(["calibrate", str(session), "-o", str(tmp_path / "out"), "--quiet"]) == status
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error
+    assert not (tmp_path / "out" / "calibration.json").exists()
+
+
+def test_a_scan_without_returns_is_left_out_with_its_reason(
+    simulated_session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = copy_session(simulated_session, tmp_path / "session")
+    empty_scan(session)
+    assert run(["calibrate", str(session), "-o", str(tmp_path / "out"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["places"]["used"] == PLACES - 1
+    assert {"what": "position 002", "reason": "no beam of its scan has a return"} in document["left_out"]
+
+
+def test_parallel_panels_are_refused(
+    simulated_session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = copy_session(simulated_session, tmp_path / "session")
+    shutil.rmtree(session / "board")
+    (session / "board").mkdir()
+    draw_flat_board(session / "board/00.png")
+    assert run(["calibrate", str(session), "-o", str(tmp_path / "out"), "--quiet"]) == 1
+    assert "parallel" in capsys.readouterr().err
+
+
+def draw_flat_board(path: Path) -> None:
+    """Two chessboards of 20 x 14 inner corners in one plane that faces the camera."""
+    import cv2
+
+    image = np.full((1234, 1624), 200, np.uint8)
+    size = 36
+    columns, rows = np.meshgrid(np.arange(21 * size) // size, np.arange(15 * size) // size)
+    squares = np.where((columns + rows) % 2 == 0, 30, 200).astype(np.uint8)
+    for top in (40, 650):
+        image[top : top + squares.shape[0], 400 : 400 + squares.shape[1]] = squares
+    assert cv2.imwrite(str(path), cv2.GaussianBlur(image, (0, 0), 0.8))
