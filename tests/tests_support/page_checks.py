@@ -39,6 +39,16 @@ _CUT_OFF = """
 }).map((e) => e.tagName + "." + e.className + ": " + e.textContent.slice(0, 60))
 """
 
+# Cells whose text leaves them.
+_CELLS = """
+[...document.querySelectorAll("td, th")].filter((cell) => {
+  const range = document.createRange();
+  range.selectNodeContents(cell);
+  const text = range.getBoundingClientRect(), box = cell.getBoundingClientRect();
+  return box.width > 0 && text.width > 0 && (text.right > box.right + 1 || text.left < box.left - 1);
+}).map((cell) => cell.textContent.slice(0, 60))
+"""
+
 # Every visible drawing has a size and at least one mark beyond its axes.
 _FIGURES = """
 [...document.querySelectorAll("figure")].map((f) => {
@@ -74,6 +84,9 @@ def assert_sound(page: Page) -> None:
     assert [title for title, marks in drawn if not marks] == []
     assert page.run("document.documentElement.scrollWidth <= innerWidth"), page.run(_CUT_OFF)
     assert page.run(_CUT_OFF) == []
+    page.run("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+    assert page.run(_CELLS) == []
+    assert page.run("document.documentElement.scrollWidth <= innerWidth"), page.run(_CUT_OFF)
     assert page.run(_TEXT_TROUBLE) == []
 
 

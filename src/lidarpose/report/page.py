@@ -12,6 +12,8 @@ from lidarpose.report.markup import Markup, el, join, json_script
 # Nothing may be fetched, whatever a name in the user's files says.
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
+PANEL_CLASSES = ("p1", "p2")
+"""Classes of the style sheet for the board's two panels (and for other pairs)."""
 DESK_WIDE_PX, DESK_HALF_PX, PHONE_PX = 1034.0, 490.0, 336.0
 
 Drawing = Callable[[float], Markup]
@@ -142,12 +144,24 @@ def legend_key(kind: Literal["line", "dash", "dot", "box", "cross"], class_: str
     return el("li", el("svg", signs[kind], viewbox="0 0 22 12", aria_hidden="true"), el("span", text))
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[object]], numeric: Iterable[int] = ()) -> Markup:
-    """A table; columns in `numeric` are set flush right."""
+def table(
+    header: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    numeric: Iterable[int] = (),
+    *,
+    stacked_em: float | None = None,
+) -> Markup:
+    """A table; columns in `numeric` are set flush right.
+
+    `stacked_em`: on a phone the last column goes below the others, and those between it and the first are so wide.
+    """
     right = set(numeric)
     head = el("tr", *(el("th", h, class_="num" if k in right else None) for k, h in enumerate(header)))
     body = [el("tr", *(el("td", c, class_="num" if k in right else None) for k, c in enumerate(row))) for row in rows]
-    return el("div", el("table", el("thead", head), el("tbody", *body)), class_="scroll")
+    stacked = stacked_em is not None
+    style = f"--columns:{len(header) - 2};--cell:{stacked_em:g}em" if stacked else None
+    content = el("table", el("thead", head), el("tbody", *body), class_="stacked" if stacked else None, style=style)
+    return el("div", content, class_="scroll")
 
 
 def bullets(items: Iterable[object], *, ordered: bool = False) -> Markup:

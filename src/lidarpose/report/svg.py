@@ -312,6 +312,11 @@ def path_data(x: ArrayLike, y: ArrayLike) -> str:
     return "".join(out)
 
 
+def columns_of(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points (N, 2) as what charts take: x (N,) and y (N,)."""
+    return points[:, 0], points[:, 1]
+
+
 def _text(u: float, v: float, text: str, class_: str, anchor: AttributeValue = "start") -> Markup:
     return el(
         "text",

@@ -106,7 +106,8 @@ def _extra_steps(estimate: TurntableEstimate) -> Iterator[str]:
     for extra in sorted(called, key=lambda e: -abs(e.value) / max(e.sigma, 1e-300))[:1]:
         step = _EXTRA_STEPS.get(extra.name)
         if step:
-            yield step
+            option = extra.name.removesuffix("_m").replace("_", "-")
+            yield f"{step} If it cannot be mended, calibrate with --estimate {option}."
 
 
 def _left_out_steps(run: TurntableRun) -> Iterator[str]:

@@ -8,9 +8,12 @@ import numpy as np
 
 from lidarpose.model.image import GrayImage
 from lidarpose.model.session import DEFAULT_PLACEMENT
+from lidarpose.model.turntable import PARAMETER_NAMES
 from lidarpose.model.turntable_result import KINDS, Direction, TurntableEstimate
 from lidarpose.model.turntable_run import TruthError, TurntableRun
-from lidarpose.report import turntable_figures as figures
+from lidarpose.report import turntable_certainty as certainty
+from lidarpose.report import turntable_residuals as residuals
+from lidarpose.report import turntable_seen as seen
 from lidarpose.report.markup import Markup, el
 from lidarpose.report.numbers import fixed, plural, short
 from lidarpose.report.page import (
@@ -203,8 +206,8 @@ def _seen_section(run: TurntableRun, board_image: GrayImage | BoardImages | None
             image = board_image.get(placement)
         else:
             image = board_image if placement in (DEFAULT_PLACEMENT, next(iter(run.observations.corners))) else None
-        blocks.append(figures.board_figure(run, placement, image))
-    return section("What was found", "", *blocks, *figures.scan_figures(run))
+        blocks.append(seen.board_figure(run, placement, image))
+    return section("What was found", "", *blocks, *seen.scan_figures(run))
 
 
 def _residual_sections(run: TurntableRun) -> Iterator[Markup]:
@@ -212,10 +215,10 @@ def _residual_sections(run: TurntableRun) -> Iterator[Markup]:
     if estimate is None:
         return
     blocks = [
-        *(figures.residuals_by_place(run, estimate, kind) for kind in ("stripes", "ranges")),
-        *(figures.residual_histogram(estimate, kind) for kind in KINDS),
-        figures.corner_arrows(run, estimate),
-        figures.stripe_map(run, estimate),
+        *(residuals.residuals_by_place(run, estimate, kind) for kind in ("stripes", "ranges")),
+        *(residuals.residual_histogram(estimate, kind) for kind in KINDS),
+        residuals.corner_arrows(run, estimate),
+        residuals.stripe_map(run, estimate),
     ]
     lead = (
         "What measurements and answer differ by. Sound residuals look like noise: no place, region or kind stands out."
@@ -231,14 +234,14 @@ def _certainty_sections(run: TurntableRun, numbers: TurnNumbers | None) -> Itera
     yield section(
         "How sure, over the turn",
         lead,
-        *figures.turn_figures(run, numbers, wished(run)),
+        *certainty.turn_figures(run, numbers, wished(run)),
         card("In numbers", _table(numbers)),
     )
     if run.estimate is not None and run.estimate.directions:
         yield section(
             "Strong and weak directions",
             "What the recording determines worst, and what to record to mend it.",
-            card("", _directions(run.estimate)),
+            card("", _directions(run.estimate), folded("All ten numbers of the motion", _ten_numbers(run))),
             *_extras(run.estimate),
         )
 
@@ -266,7 +269,23 @@ def _directions(estimate: TurntableEstimate) -> Markup:
             )
         )
     header = ("direction, weakest first", "mm", "°", "at", "to mend it")
-    return table(header, rows, numeric=(1, 2, 3))
+    return table(header, rows, numeric=(1, 2, 3), stacked_em=4.4)
+
+
+def _ten_numbers(run: TurntableRun) -> Markup:
+    """What each number of the motion is known to, the best first."""
+    covariance = run.calibration.motion_covariance
+    assert covariance is not None
+    rows = []
+    for k, name in enumerate(PARAMETER_NAMES):
+        sigma = float(np.sqrt(max(covariance[k, k], 0.0)))
+        length = name.endswith("_m")
+        size = 1e3 * sigma if length else float(np.rad2deg(sigma))
+        words = name.removesuffix("_m").removesuffix("_rad")
+        rows.append((size if length else 10.0 * size, words, f"{short(size)} {'mm' if length else '°'}"))
+    listed = [(el("code", words), value) for _, words, value in sorted(rows)]
+    note = "Small changes of the two transforms: shift along and turn about the parent frame's axes, and the radius."
+    return el("div", table(("number", "standard deviation"), listed, numeric=(1,)), el("p", note, class_="muted"))
 
 
 def _weight(direction: Direction) -> float:
@@ -291,7 +310,7 @@ def _extras(estimate: TurntableEstimate) -> Iterator[Markup]:
                 f"{state}. {e.note}" if e.note else state,
             )
         )
-    content = table(("parameter", "value", "σ", ""), rows, numeric=(1, 2))
+    content = table(("parameter", "value", "σ", ""), rows, numeric=(1, 2), stacked_em=6.6)
     yield card("Instrument errors that were tested or estimated", content)
 
 
@@ -323,7 +342,7 @@ def _paper_section(run: TurntableRun) -> Markup:
     blocks = [
         card("Table 1 of the turntable paper", el("p", note), table(("", "mean", "largest"), rows, (1, 2)), size="half")
     ]
-    deviation = figures.deviation_figure(run)
+    deviation = certainty.deviation_figure(run)
     if deviation is not None:
         blocks.append(deviation)
     if run.method == "joint":

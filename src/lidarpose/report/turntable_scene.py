@@ -56,6 +56,7 @@ def _add_camera(scene: Scene, camera: Camera, depth: float) -> None:
 def _add_panels(scene: Scene, run: TurntableRun) -> None:
     if run.estimate is None:
         return
+    first = next(iter(run.estimate.panel_poses), "")
     for placement, poses in run.estimate.panel_poses.items():
         for k, (panel, pose) in enumerate(zip(run.observations.panels, poses, strict=False)):
             if pose is None:
@@ -64,8 +65,8 @@ def _add_panels(scene: Scene, run: TurntableRun) -> None:
             scene.add("polygon", outline, PANEL_COLOURS[k % 2], alpha=0.14, width=1.5)
             grid = pose @ panel.corners_panel()
             scene.add("points", grid, PANEL_COLOURS[k % 2], size=1, alpha=0.55)
-            name = f"panel {k + 1}" + (f" ({placement})" if placement else "")
-            scene.label(outline.mean(axis=0), name, PANEL_COLOURS[k % 2])
+            if placement == first:
+                scene.label(outline.mean(axis=0), f"panel {k + 1}", PANEL_COLOURS[k % 2])
 
 
 def _outline(panel: Panel) -> FloatArray:
