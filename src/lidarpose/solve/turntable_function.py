@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.errors import UndeterminedError
-from lidarpose.geometry.arrays import BoolArray, FloatArray, angle_between, perpendicular_pair, unit
+from lidarpose.geometry.arrays import BoolArray, FloatArray, angle_between, perpendicular_pair, unit, wrap_angle
 from lidarpose.geometry.circles import fit_circle3
 from lidarpose.geometry.planes import fit_plane
 from lidarpose.geometry.robust import tukey_weights
@@ -25,6 +25,8 @@ from lidarpose.model.turntable import TurntableMotion
 # Readings closer than this are one and the same place (a thousandth of a degree).
 SAME_READING_RAD = 2e-5
 PAIRS = 40
+# A circle on the unit sphere smaller than this shows neither its plane nor its phase.
+SMALL_CIRCLE = 0.05
 # What a pose is known from splits in two: the light plane, and the two lines within it.
 ACROSS_SCAN_PLANE = [2, 3, 4]
 IN_SCAN_PLANE = [0, 1, 5]
@@ -84,6 +86,15 @@ def deviations(
     z = [angle_between(m.rotation[:, 2], p.rotation[:, 2]) for m, p in zip(modelled, poses, strict=True)]
     x = [angle_between(m.rotation[:, 0], p.rotation[:, 0]) for m, p in zip(modelled, poses, strict=True)]
     return FunctionDeviations(np.array(centre), np.array(z), np.array(x))
+
+
+def angles_shown(motion: TurntableMotion, turntable_angles_rad: Sequence[float], poses: Sequence[Pose]) -> FloatArray:
+    """The turntable's angle (N,) that each pose shows by its turn about the axis, the one nearest to its reading."""
+    readings = np.asarray(turntable_angles_rad, dtype=np.float64)
+    R_w, R_m = motion.T_camera_turntable.rotation, motion.T_turntable_lidar.rotation
+    turned = R_w.T @ np.stack([p.rotation for p in poses]) @ R_m.T
+    shown = np.arctan2(turned[:, 1, 0] - turned[:, 0, 1], turned[:, 0, 0] + turned[:, 1, 1])
+    return np.asarray(readings + wrap_angle(shown - readings))
 
 
 def fit_by_readings(
@@ -154,7 +165,7 @@ def fit_by_circles(turntable_angles_rad: Sequence[float], poses: Sequence[Pose])
     n_x = np.stack([p.rotation[:, 0] for p in poses])
     n_z = np.stack([p.rotation[:, 2] for p in poses])
     centres = np.stack([p.translation for p in poses])
-    widest = max((n_z, n_x), key=_circle_size) if _circle_size(n_z) < 0.05 else n_z
+    widest = n_z if _circle_size(n_z) > SMALL_CIRCLE else max((n_z, n_x), key=_circle_size)
     axis = _turning_sense(fit_plane(widest).normal, angles, widest)  # (16): the plane of the circle
     centre, arm = _circle_function(axis, angles, centres)  # (15), (18) to (21)
     R_first = _axes_function(axis, angles, n_z, n_x)  # (22) to (26), at reading 0
@@ -360,7 +371,7 @@ def _axes_function(axis: FloatArray, angles: FloatArray, n_z: FloatArray, n_x: F
     z_0 = unit(z_0)
     mean_x = unit(np.einsum("nij,nj->i", exp_so3(-angles[:, None] * axis), n_x))
     across = np.cross(axis, z_0)
-    if np.linalg.norm(across) < 1e-3:  # n_z along the axis: (25) is singular, n_x has a circle of its own
+    if np.linalg.norm(across) < SMALL_CIRCLE:  # n_z along the axis: (25) is singular, n_x has a circle of its own
         x_0 = unit(mean_x - (mean_x @ z_0) * z_0)
     else:
         in_both = np.linalg.solve(np.stack([axis, z_0, across]), [d_x, 0.0, 0.0])
