@@ -18,7 +18,7 @@ import numpy as np
 
 from lidarpose.detect.stripe_search import CoarseLine, PanelView
 from lidarpose.geometry.arrays import FloatArray
-from lidarpose.geometry.robust import mad_sigma, tukey_weights
+from lidarpose.geometry.robust import MAD_TO_SIGMA, tukey_weights
 from lidarpose.model.image import GrayImage
 from lidarpose.model.observation import StripePoints
 
@@ -37,8 +37,10 @@ _EDGE_SIGMA_PX = 2.0 * 0.03
 _PULL_PX = 1.5
 # Step of the derivative by the edges' shift, pixels.
 _EDGE_STEP = 0.1
-# Order of the unknowns: the first four are each profile's own, the rest common.
-_BACKGROUND, _HEIGHT, _EDGE, _CENTRE, _WIDTH, _RATIO = range(6)
+# Pixels that the noise is learnt from, and the bins they are sorted into.
+_NOISE_SAMPLES, _NOISE_BINS = 2000, 8
+# Order of the unknowns: the first four are each profile's own, the width is common.
+_BACKGROUND, _HEIGHT, _EDGE, _CENTRE, _WIDTH = range(5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +73,18 @@ class _Curve:
     half: float
 
     def at(self, u: FloatArray) -> FloatArray:
-        return np.asarray(np.polynomial.polynomial.polyval((u - self.middle) / self.half, self.coefficients))
+        return _horner(self.coefficients, (u - self.middle) / self.half)
 
     def slope(self, u: FloatArray) -> FloatArray:
-        derivative = np.polynomial.polynomial.polyder(self.coefficients) / self.half
-        return np.asarray(np.polynomial.polynomial.polyval((u - self.middle) / self.half, derivative))
+        derivative = self.coefficients[1:] * np.arange(1, len(self.coefficients)) / self.half
+        return _horner(derivative, (u - self.middle) / self.half)
+
+
+def _horner(coefficients: FloatArray, x: FloatArray) -> FloatArray:
+    value = np.full_like(x, coefficients[-1])
+    for c in coefficients[-2::-1]:
+        value = value * x + c
+    return value
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,23 +146,24 @@ def fit_stripe(view: PanelView, image: GrayImage, line: CoarseLine, limit: float
     curve, width = first
     band = _start_band(view, image, line.steep, u, curve, width, limit)
     state = _start(band, curve, view, width)
-    band, state, smooth = _refine(band, state, view, line.steep, curve)
+    band, state, smooth = _refine(band, state, view, line.steep, curve, steps=2)
     if isinstance(smooth, str):
         return smooth
     if _half_height(smooth.curve, u, state.width) > band.half:
         band = _start_band(view, image, line.steep, u, smooth.curve, state.width, limit)
-        state = _start(band, smooth.curve, view, state.width)
-    band, state, smooth = _refine(band, state, view, line.steep, smooth.curve)
+        state = replace(_start(band, smooth.curve, view, state.width), dark_ratio=state.dark_ratio)
+    band, state, smooth = _refine(band, state, view, line.steep, smooth.curve, steps=2)
     return smooth if isinstance(smooth, str) else _points(band, smooth, line.steep, state)
 
 
 def _refine(
-    band: _Band, state: _State, view: PanelView, steep: bool, curve: _Curve
+    band: _Band, state: _State, view: PanelView, steep: bool, curve: _Curve, steps: int
 ) -> tuple[_Band, _State, _Smooth | str]:
-    """Two steps with the albedo as it is seen about the curve, and a smooth curve through what comes out."""
+    """Steps with the albedo as it is seen about the curve, and a smooth curve through what comes out."""
     band = _look_at_albedo(band, view, steep, curve, state.width)
-    state = _step(band, state, curve, learn=True)
-    state = _step(band, state, curve, learn=False)
+    for step in range(steps):
+        state = _step(band, state, curve, learn=step == 0)
+    state = replace(state, dark_ratio=_dark_ratio(band, state))
     return band, state, _smooth(band, state)
 
 
@@ -188,8 +198,8 @@ def _cut(
     safe = np.clip(v, low, high - 1)
     along = u.astype(np.intp)[:, None]
     rows, columns = (along, safe) if steep else (safe, along)
-    values = image[rows, columns].astype(np.float32)
-    bright = view.bright[rows - view.low[1], columns - view.low[0]]
+    values = image.take(rows * image.shape[1] + columns).astype(np.float32)
+    bright = view.bright.take((rows - view.low[1]) * view.bright.shape[1] + (columns - view.low[0]))
     good = ((v == safe) & (values < 0.98 * limit)).astype(np.float32)
     slope = curve.slope(u)
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
@@ -225,13 +235,13 @@ def _column(values: FloatArray) -> FloatArray:
 def _first_curve(band: _Band, line: CoarseLine, straight: _Curve) -> tuple[_Curve, float] | str:
     """A curve within about a pixel, from the brightest pixel of each profile, and the stripe's rough width."""
     rest = band.values - np.float32(line.ambient_share) * band.bright
-    rest = rest - np.median(rest, axis=1, keepdims=True)
+    rest -= rest.mean(axis=1, keepdims=True)
     smooth = rest.copy()
     smooth[:, 1:-1] = 0.25 * rest[:, :-2] + 0.5 * rest[:, 1:-1] + 0.25 * rest[:, 2:]
     peak = np.argmax(smooth, axis=1)
     rows = np.arange(len(peak))
     height = smooth[rows, peak]
-    strong = height > 0.4 * np.percentile(height, 75)
+    strong = height > 0.4 * _quantile(height, 0.75)
     offset = band.v[rows, peak] - straight.at(band.u)
     weight = np.where(strong, 1.0, 0.0)
     curve = straight
@@ -244,16 +254,34 @@ def _first_curve(band: _Band, line: CoarseLine, straight: _Curve) -> tuple[_Curv
     window = np.clip(peak[chosen][:, None] + np.arange(-9, 10), 0, rest.shape[1] - 1)
     area = np.maximum(rest[chosen[:, None], window], 0.0).sum(axis=1) / height[chosen]
     cosine = 1.0 / np.sqrt(1.0 + curve.slope(band.u[chosen]) ** 2)
-    return curve, float(np.clip(np.median(area * cosine) / np.sqrt(2.0 * np.pi), 0.6, 6.0))
+    # Speckle makes the highest pixel too high, by this much typically, and the width too small.
+    width = 1.15 * _quantile(area * cosine, 0.5) / np.sqrt(2.0 * np.pi)
+    return curve, float(np.clip(width, 0.6, 6.0))
 
 
 def _fit_curve(u: FloatArray, v: FloatArray, weight: FloatArray, degree: int) -> _Curve:
-    used = weight > 0
-    middle, half = float(u[used].min() + u[used].max()) / 2.0, max(float(np.ptp(u[used])) / 2.0, 1.0)
-    root = np.sqrt(weight[used])
-    design = np.polynomial.polynomial.polyvander((u[used] - middle) / half, degree)
-    coefficients = np.linalg.lstsq(design * root[:, None], v[used] * root, rcond=None)[0]
+    """Weighted least squares; well conditioned in a coordinate from -1 to 1."""
+    middle, half = 0.5 * float(u[0] + u[-1]), max(0.5 * float(u[-1] - u[0]), 1.0)
+    s = (u - middle) / half
+    powers = [np.ones_like(s)]
+    for _ in range(degree):
+        powers.append(powers[-1] * s)
+    design = np.stack(powers)
+    weighted = design * weight
+    normal = weighted @ design.T
+    coefficients = np.linalg.solve(normal + np.eye(degree + 1) * (1e-12 * np.trace(normal)), weighted @ v)
     return _Curve(coefficients, middle, half)
+
+
+def _quantile(values: FloatArray, share: float) -> float:
+    """As numpy's, to the nearest value, without its checks."""
+    k = int(share * (len(values) - 1))
+    return float(np.partition(values, k)[k])
+
+
+def _spread(values: FloatArray) -> float:
+    """Robust standard deviation about zero."""
+    return MAD_TO_SIGMA * _quantile(np.abs(values), 0.5) if len(values) else float("nan")
 
 
 def _start(band: _Band, curve: _Curve, view: PanelView, width: float) -> _State:
@@ -265,7 +293,7 @@ def _start(band: _Band, curve: _Curve, view: PanelView, width: float) -> _State:
     rest = band.values - background[:, None]
     height = (rest * core).sum(axis=1) / np.maximum(core.sum(axis=1), 1.0) / 0.85
     reading = 1.25 * float((np.abs(rest) * flank).sum() / max(float(flank.sum()), 1.0))
-    ratio = float(np.clip(np.median(view.albedo.dark / np.maximum(view.albedo.light, 1.0)), 0.0, 0.95))
+    ratio = float(np.clip(np.median(view.albedo.dark / np.maximum(view.albedo.light, 1.0)), 0.02, 0.95))
     noise = (max(reading, 0.3) ** 2, 0.0, 0.0)
     return _State(np.maximum(height, 1.0), centre, background, width, ratio, noise, np.ones(len(centre)))
 
@@ -326,77 +354,85 @@ def _step(band: _Band, state: _State, curve: _Curve, *, learn: bool) -> _State:
     """One Gauss-Newton step; with `learn`, the noise is learnt again first."""
     distance = _distance(band, state.centre) * np.float32(1.0 / state.width)
     squared = distance * distance
-    bell = np.exp(-0.5 * squared)
+    bell = np.exp(np.float32(-0.5) * squared)
     ratio, height = np.float32(state.dark_ratio), _column(state.height)
     by_height = bell * (ratio + (1 - ratio) * band.light)
     signal = height * by_height
     tall = height * bell
     rest = band.values - _column(state.background)
     residual = rest - signal
-    level = np.maximum(rest + band.ambient + _column(state.background), 0.0)
+    level = np.maximum(band.values + band.ambient, np.float32(0.0))
     noise = _learn_noise(residual, level, signal, band.good, state.noise) if learn else state.noise
     variance = np.float32(noise[0]) + np.float32(noise[1]) * level + np.float32(noise[2]) * signal * signal
     weight = band.good / variance
-    J = (
+    J = [
         np.ones_like(signal),
         by_height,
         tall * ((1 - ratio) * band.by_edge),
         signal * distance * _column(band.cosine / state.width),
         signal * squared,
-        tall * (1 - band.light),
-        residual,
-    )
-    M = _normal_equations(J, weight)
-    M[_BACKGROUND, _BACKGROUND] += 1e-9
-    M[_HEIGHT, _HEIGHT] += 1e-9
-    M[_EDGE, _EDGE] += 1.0 / _EDGE_SIGMA_PX**2
-    M[_CENTRE, _CENTRE] += 1.0 / _PULL_PX**2
-    M[_CENTRE, -1] += (curve.at(band.u) - state.centre) / _PULL_PX**2
-    change, common, information = _solve(M)
+    ]
+    M = _normal_equations(J, residual, weight)
+    M[_BACKGROUND][0] += 1e-9
+    M[_HEIGHT][0] += 1e-9
+    M[_EDGE][0] += 1.0 / _EDGE_SIGMA_PX**2
+    M[_CENTRE][0] += 1.0 / _PULL_PX**2
+    M[_CENTRE][-1] += (curve.at(band.u) - state.centre) / _PULL_PX**2
+    change, by_width, information = _solve(M)
     return _State(
         np.maximum(state.height + change[_HEIGHT], 1e-3),
         state.centre + np.clip(change[_CENTRE], -1.0, 1.0),
         state.background + change[_BACKGROUND],
-        float(np.clip(state.width * np.exp(common[0]), 0.4, 10.0)),
-        float(np.clip(state.dark_ratio + common[1], 0.0, 1.0)),
+        float(np.clip(state.width * np.exp(by_width), 0.4, 10.0)),
+        state.dark_ratio,
         noise,
         information,
     )
 
 
-def _normal_equations(J: tuple[FloatArray, ...], weight: FloatArray) -> FloatArray:
-    """Sums (6, 7, N) over each profile of weight * J_i * J_j; the last column belongs to the residual."""
-    M = np.empty((6, 7, len(weight)))
-    for i in range(6):
-        weighted = J[i] * weight
-        for j in range(i, 7):
-            M[i, j] = np.einsum("np,np->n", weighted, J[j])
-            if j < 6:
-                M[j, i] = M[i, j]
-    return M
+def _normal_equations(J: list[FloatArray], residual: FloatArray, weight: FloatArray) -> list[FloatArray]:
+    """Upper triangle, row by row, of the sums over each profile of weight * J_i * J_j; last in each row, the residual.
 
-
-def _solve(M: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Changes (4, N) of the profiles' own unknowns, (2,) of the common ones, and the centres' information (N,).
-
-    Gauss's elimination of each profile's own unknowns, what is left summed over the profiles. `M` is used up.
+    Row i is an array (k - i + 1, N) of k unknowns' products, from the diagonal on.
     """
-    own = 4
-    for k in range(own):
-        pivot = M[k, k + 1 :] / M[k, k]
-        M[k + 1 :, k + 1 :] -= M[k + 1 :, k, None] * pivot
-    information = M[_CENTRE, _CENTRE]
-    left = M[own:, own:].sum(axis=-1)
-    # Weak pulls to where they are: the ratio (to 0.1) cannot be told where no profile crosses an edge.
-    common = np.linalg.solve(left[:, :2] + np.diag([1e-6, 100.0]), left[:, 2])
-    common = np.clip(common, [-0.3, -0.1], [0.3, 0.1])
-    change = np.empty((own, M.shape[-1]))
-    for k in reversed(range(own)):
-        value = M[k, -1] - M[k, _WIDTH] * common[0] - M[k, _RATIO] * common[1]
-        for j in range(k + 1, own):
-            value = value - M[k, j] * change[j]
-        change[k] = value / M[k, k]
-    return change, common, information
+    rows = []
+    for i in range(len(J)):
+        weighted = J[i] * weight
+        rows.append(np.stack([np.einsum("np,np->n", weighted, other) for other in (*J[i:], residual)]).astype(float))
+    return rows
+
+
+def _solve(rows: list[FloatArray]) -> tuple[list[FloatArray], float, FloatArray]:
+    """Changes (N,) of the profiles' four unknowns, of the width's logarithm, and the centres' information (N,).
+
+    Gauss's elimination of each profile's own unknowns, what is left summed over the profiles. `rows` are used up.
+    """
+    for k in range(_WIDTH):
+        share = rows[k][1:-1] / rows[k][0]
+        for i in range(k + 1, len(rows)):
+            rows[i] -= share[i - k - 1] * rows[k][i - k :]
+    normal, goal = rows[_WIDTH].sum(axis=-1)
+    by_width = float(np.clip(goal / (normal + 1e-6), -0.3, 0.3))
+    changes: list[FloatArray] = [np.zeros(0)] * _WIDTH
+    for k in reversed(range(_WIDTH)):
+        value = rows[k][-1] - rows[k][_WIDTH - k] * by_width
+        for j in range(k + 1, _WIDTH):
+            value = value - rows[k][j - k] * changes[j]
+        changes[k] = value / rows[k][0]
+    return changes, by_width, np.asarray(rows[_CENTRE][0])
+
+
+def _dark_ratio(band: _Band, state: _State) -> float:
+    """Light that dark squares send back against light ones, at the laser's colour: from the profiles wholly on either.
+
+    Not fitted with the rest: its product with the heights makes a bad start worse.
+    """
+    share = band.light[:, band.half]
+    light, dark = state.height[share > 0.98], state.height[share < 0.02]
+    if min(len(light), len(dark)) < 20:
+        return state.dark_ratio
+    seen = state.dark_ratio * _quantile(dark, 0.5) / _quantile(light, 0.5)
+    return float(np.clip(seen, 0.01, 1.0))
 
 
 def _learn_noise(
@@ -405,19 +441,22 @@ def _learn_noise(
     """Variance as r^2 + g * level + s^2 * signal^2 (all >= 0), from residuals sorted into bins by the signal."""
     from scipy.optimize import nnls
 
-    some = np.flatnonzero(good.ravel()[::3]) * 3
-    if len(some) < 100:
+    step = max(good.size // _NOISE_SAMPLES, 1)
+    some = np.flatnonzero(good.ravel()[::step]) * step
+    if len(some) < 12 * _NOISE_BINS:
         return before
-    error, level, signal = np.abs(residual.ravel()[some]), level.ravel()[some], signal.ravel()[some]
+    some = some[: len(some) // _NOISE_BINS * _NOISE_BINS]
+    signal = signal.ravel()[some]
     order = np.argsort(signal)
-    rows = []
-    for part in np.array_split(order, 8):
-        # Medians are deaf to what does not belong; a sixth of the freedom went into the fit.
-        variance = 1.2 * (1.4826 * float(np.median(error[part]))) ** 2
-        rows.append((max(variance, 0.05), float(level[part].mean()), float((signal[part] ** 2).mean())))
-    table = np.array(rows)
-    design = np.column_stack([np.ones(len(table)), table[:, 1:]]) / table[:, :1]
-    solution, _ = nnls(design, np.ones(len(table)))
+    error, level, signal = (
+        x.reshape(_NOISE_BINS, -1)
+        for x in (np.abs(residual.ravel()[some])[order], level.ravel()[some[order]], signal[order])
+    )
+    # Medians are deaf to what does not belong; a sixth of the freedom went into the fit.
+    middle = error.shape[1] // 2
+    variance = np.maximum(1.2 * (MAD_TO_SIGMA * np.partition(error, middle, axis=1)[:, middle]) ** 2, 0.05)
+    design = np.stack([np.ones(_NOISE_BINS), level.mean(axis=1), (signal**2).mean(axis=1)], axis=1)
+    solution, _ = nnls(design / variance[:, None], np.ones(_NOISE_BINS))
     return (max(float(solution[0]), 0.05), float(solution[1]), float(solution[2]))
 
 
@@ -433,10 +472,10 @@ def _smooth(band: _Band, state: _State) -> _Smooth | str:
         curve = _fit_curve(band.u, state.centre, robust, degree)
         residual = state.centre - curve.at(band.u)
         standardised = residual / sigma
-        scale = max(mad_sigma(standardised[weight > 0], centred=True), 1.0)
+        scale = max(_spread(standardised[weight > 0]), 1.0)
         robust = weight * tukey_weights(standardised / scale)
     kept = np.where(np.abs(standardised) < 4.0 * scale, weight, 0.0)
-    spread = mad_sigma((residual * band.cosine)[kept > 0], centred=True)
+    spread = _spread((residual * band.cosine)[kept > 0])
     if not spread < 0.5 * max(state.width, 1.0):
         return "the bright line on the panel is not the narrow straight line that a laser makes"
     return _Smooth(curve, kept, residual)
@@ -457,12 +496,12 @@ def _points(band: _Band, smooth: _Smooth, steep: bool, state: _State) -> StripeF
     if len(u) < _MIN_POINTS:
         return "no stripe on the panel: too few profiles show it"
     freedom = np.sqrt(max(len(u) - 4, 1) / len(u))
-    inflation = max(mad_sigma(offset / sigma, centred=True) / freedom, 1.0)
+    inflation = max(_spread(offset / sigma) / freedom, 1.0)
     norm = np.hypot(cosine, sine)
     cosine, sine = cosine / norm, sine / norm
     sigma = sigma * inflation * cosine
     # Points on dark squares beside points on light ones: a hundredth of their weight, and mostly trouble.
-    best = np.percentile(sigma, 20)
+    best = _quantile(sigma, 0.2)
     worth = sigma < max(8.0 * best, 0.1)
     u, offset, cosine, sine, sigma = u[worth], offset[worth], cosine[worth], sine[worth], sigma[worth]
     normals = np.stack([cosine, -sine] if steep else [-sine, cosine], axis=-1)

@@ -13,7 +13,8 @@ from lidarpose.model.image import GrayImage
 
 # Panels are reduced to about this many pixels across; a stripe keeps most of its height at a quarter of the size.
 _SMALL_SIDE = 180
-_HYPOTHESES = 150
+# Random places, the same for all images, at which pairs of maxima are drawn.
+_DRAWS = np.random.default_rng(0).random((2, 80))
 # A second line with this share of the first one's support makes the choice between them a guess.
 _AMBIGUOUS = 0.5
 # A stripe, saturated or not, is narrower than twice this many reduced pixels.
@@ -263,31 +264,33 @@ def _consensus(
     x: FloatArray, y: FloatArray, height: FloatArray, extent: int
 ) -> tuple[float, float, BoolArray, float] | None:
     """RANSAC for y = intercept + slope x, |slope| <= 1.5, among the maxima; None if chance explains the support."""
-    rng = np.random.default_rng(0)
     weight = np.minimum(height, np.median(height))
-    a, b = rng.integers(0, len(x), (2, _HYPOTHESES))
-    apart = np.abs(x[a] - x[b]) >= 4
-    if not apart.any():
-        return None
-    a, b = a[apart], b[apart]
+    # Pairs of one from each half: far enough apart to give a direction.
+    half = len(x) // 2
+    a = (_DRAWS[0] * half).astype(np.intp)
+    b = half + (_DRAWS[1] * (len(x) - half)).astype(np.intp)
     slope = (y[b] - y[a]) / (x[b] - x[a])
     intercept = y[a] - slope * x[a]
     near = np.abs(intercept[:, None] + slope[:, None] * x - y) <= 1.5
-    support = (near * weight).sum(axis=1) * (np.abs(slope) <= 1.5)
+    support = (near @ weight) * (np.abs(slope) <= 1.5)
     best = int(np.argmax(support))
     inliers = near[best]
+    s = (x - x[0]) / (x[-1] - x[0])
+    powers = np.stack([np.ones_like(s), s, s * s])
     for _ in range(2):
-        design = np.column_stack([np.ones(inliers.sum()), x[inliers], x[inliers] ** 2])
-        if len(design) < 6:
+        if np.count_nonzero(inliers) < 6:
             return None
         # A little bend: lenses.
-        c = np.linalg.lstsq(design, y[inliers], rcond=None)[0]
-        inliers = np.abs(c[0] + c[1] * x + c[2] * x**2 - y) <= 1.5
+        used = powers * inliers
+        c = np.linalg.solve(used @ powers.T + 1e-9 * np.eye(3), used @ y)
+        inliers = np.abs(c @ powers - y) <= 1.5
     by_chance = len(x) * 4.0 / extent
     if inliers.sum() < max(6.0, 3.0 * by_chance):
         return None
-    fit = np.polyfit(x[inliers], y[inliers], 1)
-    return float(fit[0]), float(fit[1]), inliers, float(weight[inliers].sum())
+    u, v = x[inliers], y[inliers]
+    centred = u - u.mean()
+    slope_fit = float(centred @ v / (centred @ centred))
+    return slope_fit, float(v.mean() - slope_fit * u.mean()), inliers, float(weight[inliers].sum())
 
 
 def _erase(ridge: FloatArray, line: _SmallLine, steep: bool) -> None:
