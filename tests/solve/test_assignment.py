@@ -113,3 +113,24 @@ def test_places_that_cannot_be_used_are_left_out_with_their_reasons(rig_maker: C
     assert wrong_places(result.places, {p.position: p for p in observations.places}) == []
     with pytest.raises(UndeterminedError, match="position 001: no usable stripe on panel 2"):
         assign(observations.camera, poses, places[:3])
+
+
+def test_a_rival_that_differs_at_one_place_alone_is_no_rival() -> None:
+    rig = draw_rig(5, places=12)
+    observations = simulate_observations(rig, stripe_step_px=6.0, seed=1)
+    poses = {name: board_poses(observations.camera, c, name) for name, c in observations.corners.items()}
+    places = []
+    for k, p in enumerate(observations.places):
+        lines = list(p.scan_lines.values())
+        if k == 1:  # detection broke one line in two, and either part could be it
+            n = len(lines[0])
+            lines += [part_of(lines[0], 0, n * 6 // 10), part_of(lines[0], n * 4 // 10, n)]
+            lines[0] = part_of(lines[0], 0, n // 8)
+        places.append(PlaceFeatures(p.position, p.turntable_angle_rad, p.stripes, tuple(lines), p.placement))
+    result = assign(observations.camera, poses, places)
+    assert len(result.places) >= 11
+    assert result.motion.pose(0.1).distance(rig.motion.pose(0.1))[0] < 5e-3
+
+
+def part_of(line: ScanLine, start: int, stop: int) -> ScanLine:
+    return ScanLine(line.angle_rad[start:stop], line.range_m[start:stop], line.sigma_m[start:stop])

@@ -309,6 +309,12 @@ def _add(found: list[_Solution], solution: _Solution | None) -> None:
         found.append(solution)
 
 
+def _is_same(a: _Solution, b: _Solution) -> bool:
+    """Whether two solutions make the same choice at most places: then they are one, but for some bad places."""
+    both = (a.chosen >= 0) & (b.chosen >= 0)
+    return bool(both.any() and np.mean(a.chosen[both] == b.chosen[both]) > 0.5)
+
+
 def _score(misfit: FloatArray) -> float:
     """Mean bounded misfit of the places: 0 fits, 1 does not."""
     with np.errstate(invalid="ignore"):
@@ -403,6 +409,7 @@ def _decide(
 ) -> tuple[_Solution, str, dict[str, float]]:
     """The solution that the evidence is for, what decided, and the figures. Raises where nothing decides."""
     best = solutions[0]
+    solutions = [best, *(s for s in solutions[1:] if not _is_same(best, s))]
     figures = {"solutions": float(len(solutions)), "rms_sigmas": _rms(best.misfit, _support(best))}
     look = partial(_rms_with_panels, pool, places, panel_poses)
     rivals = [s for s in solutions[1:] if not _beaten_by_motion(pool, best, s, look)]
