@@ -23,6 +23,7 @@ from lidarpose.measure.outline import (
     grid_step,
     in_plane,
     judge,
+    rim,
     without_pinholes,
 )
 from lidarpose.measure.patches import Patch, find_patches
@@ -117,7 +118,7 @@ def measure_round(beams: Beams, sigma: float, kind: Kind, *, seed: int = 0) -> l
     for patch in find_patches(beams.points, sigma):
         for outline in _outlines(beams, patch, kind, seed):
             measurement = _measure(beams, patch, outline, sigma, seed)
-            if measurement is not None:
+            if measurement is not None and measurement.covered > 0.3:
                 found.append(measurement)
     return sorted(found, key=lambda m: -m.covered * np.sqrt(m.edge_beams))
 
@@ -134,10 +135,12 @@ def _outlines(beams: Beams, patch: Patch, kind: Kind, seed: int) -> list[RoundOu
     with np.errstate(invalid="ignore"):
         beyond = ~patch.mask & ~(box.range_m < distance)
     flat = np.isfinite(place).all(axis=-1)
-    edges = [border(without_pinholes(patch.mask))] if kind == "disk" else _cavity_borders(patch.mask)
+    if kind == "disk":
+        edges = [place[border(without_pinholes(patch.mask)) & flat]]
+    else:
+        edges = [rim(cavity, patch.mask, place, step) for cavity in _cavities(patch.mask)]
     outlines = []
-    for edge_mask in edges:
-        edge = place[edge_mask & flat]
+    for edge in edges:
         extent = float(np.ptp(edge, axis=0).max()) if len(edge) else 0.0
         circle = find_circle(edge, 0.75 * step, smallest=3.0 * step, largest=0.75 * extent, seed=seed)
         if circle is None:
@@ -149,13 +152,13 @@ def _outlines(beams: Beams, patch: Patch, kind: Kind, seed: int) -> list[RoundOu
     return outlines
 
 
-def _cavity_borders(mask: BoolArray) -> list[BoolArray]:
-    """The border of each enclosed gap of a patch, on the patch."""
+def _cavities(mask: BoolArray) -> list[BoolArray]:
+    """The enclosed gaps of a patch."""
     labels, count = ndimage.label(~mask)
     outside = set(np.unique(np.r_[labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     cavities = [k for k in range(1, count + 1) if k not in outside and sizes[k] >= LEAST_GAP]
-    return [ndimage.binary_dilation(labels == k) & mask for k in cavities]
+    return [labels == k for k in cavities]
 
 
 def _box(beams: Beams, patch: Patch) -> Beams:
@@ -347,15 +350,18 @@ def _backgrounds(
     bounded = (share_none < 0.6) & (behind.sum(axis=1) >= 5) & (delta > 4.0 * noise)
     bounded &= spread < 5.0 * noise + 0.1 * np.abs(delta)
     open_ = share_none > 0.7
-    usable = (bounded | open_) & ~blocked
+    # A background that is there but no plane (clutter, another edge): a beam ends on the material or behind it.
+    clutter = ~bounded & ~open_ & (excess > 5.0 * noise).any(axis=1)
+    usable = (bounded | open_ | clutter) & ~blocked
     safe = np.where(bounded, delta, 1.0)
     depth = view.excess[near] / safe
     depth = np.where(open_ & np.isfinite(depth), 0.0, depth)
+    depth = np.where(clutter, np.where(view.excess[near] < 5.0 * noise, 0.0, np.nan), depth)
     far = np.sqrt(noise**2 + spread**2 + drawn**2)
     sigma = np.stack([np.full(len(near), noise), far], -1) / safe[:, None]
     # Something returned from behind where nothing else does: no edge of this disk.
     usable &= ~(open_ & (view.excess[near] > 5.0 * noise))
-    return usable, open_, depth, sigma
+    return usable, open_ | clutter, depth, sigma
 
 
 def _result(view: _View, outline: RoundOutline, near: IntArray, edge: EdgeBeams, fit: EdgeFit) -> RoundMeasurement:
@@ -365,7 +371,8 @@ def _result(view: _View, outline: RoundOutline, near: IntArray, edge: EdgeBeams,
     offset = edge.place - fit.centre
     s = np.linalg.norm(offset, axis=1) - fit.radius
     support = EdgeSupport(view.plane, view.index[view.plane_used], view.index[near], s, fit.centre, fit.radius)
-    sectors = np.unique(np.floor(np.arctan2(offset[:, 1], offset[:, 0]) / (2.0 * np.pi) * 72.0))
+    count = min(72, max(8, len(near) // 4))
+    sectors = np.unique(np.floor(np.arctan2(offset[:, 1], offset[:, 0]) / (2.0 * np.pi) * count))
     draft = RoundMeasurement(
         outline.kind,
         2.0 * fit.radius,
@@ -376,7 +383,7 @@ def _result(view: _View, outline: RoundOutline, near: IntArray, edge: EdgeBeams,
         None,
         2.0 * outline.circle.radius,
         fit,
-        len(sectors) / 72.0,
+        min(1.0, len(sectors) / count),
         len(near),
         len(view.plane_used),
         view.plane_rms,

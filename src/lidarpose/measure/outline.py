@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from lidarpose.errors import UndeterminedError
-from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.circles import Circle2, fit_circle2
 from lidarpose.geometry.planes import Plane
 
@@ -54,6 +54,22 @@ def border(mask: BoolArray) -> BoolArray:
     return np.asarray(mask & ~inner)
 
 
+def rim(cavity: BoolArray, mask: BoolArray, place: FloatArray, step: float) -> FloatArray:
+    """Points (n, 2) half-way between the last beam on a patch and the first in a gap of it.
+
+    Neighbours much farther apart than `step` (rings of a LiDAR that lie far from each other) bracket the rim too widely
+    to be of use.
+    """
+    points = []
+    for axis in (0, 1):
+        first = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
+        second = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
+        crosses = (cavity[first] & mask[second]) | (mask[first] & cavity[second])
+        near = np.linalg.norm(place[first] - place[second], axis=-1) < 2.0 * step
+        points.append(0.5 * (place[first] + place[second])[crosses & near])
+    return np.concatenate(points)
+
+
 def grid_step(place: FloatArray, mask: BoolArray) -> float:
     """The larger of the median distances between neighbours of a grid (N, M, 2) along its two axes, on a mask."""
     steps = []
@@ -72,7 +88,7 @@ def in_plane(points: FloatArray, plane: Plane, frame: FloatArray) -> FloatArray:
 
 def find_circle(edge: FloatArray, tolerance: float, *, smallest: float, largest: float, seed: int) -> Circle2 | None:
     """The circle that most border points (n, 2) lie near: RANSAC from triples, then refits."""
-    if len(edge) < 12:
+    if len(edge) < 8:
         return None
     rng = np.random.default_rng(seed)
     triples = edge[rng.integers(0, len(edge), (600, 3))]
@@ -87,7 +103,7 @@ def find_circle(edge: FloatArray, tolerance: float, *, smallest: float, largest:
     circle = Circle2(centres[best], float(radii[best]))
     for _ in range(5):
         inliers = np.abs(circle.distance(edge)) < tolerance
-        if np.count_nonzero(inliers) < 8:
+        if np.count_nonzero(inliers) < 7:
             return None
         try:
             circle = fit_circle2(edge[inliers])
@@ -133,8 +149,9 @@ def judge(
     inner, outer = (s < -1.5 * step) & (s > -0.9 * circle.radius - 1.5 * step), (s > 1.5 * step) & (s < 5.0 * step)
     if np.count_nonzero(inner) < 6 or np.count_nonzero(outer) < 6:
         return None
-    sectors = _sector(edge[np.abs(circle.distance(edge)) < 1.2 * step] - circle.centre)
-    covered = len(np.unique(sectors)) / _SECTORS
+    near = edge[np.abs(circle.distance(edge)) < 1.2 * step] - circle.centre
+    sectors = min(_SECTORS, max(8, len(near)))
+    covered = len(np.unique(_sector(near, sectors))) / sectors
     if covered < _LEAST_COVERED:
         return None
     # What stands before a disk may hide some of it; nothing may be seen through it.
@@ -147,9 +164,9 @@ def judge(
     return None
 
 
-def _sector(offset: FloatArray) -> FloatArray:
+def _sector(offset: FloatArray, sectors: int) -> IntArray:
     angle = np.arctan2(offset[:, 1], offset[:, 0])
-    return np.asarray(np.floor((angle / (2.0 * np.pi) + 0.5) * _SECTORS).astype(np.int64) % _SECTORS)
+    return np.asarray(np.floor((angle / (2.0 * np.pi) + 0.5) * sectors).astype(np.int64) % sectors)
 
 
 def nothing_round(kind: Kind) -> UndeterminedError:
