@@ -39,17 +39,17 @@ def measure_disk(
         The turntable turned on during the sweeps: interpolate its readings by time_s.npy.
     """
     from lidarpose.cli.console import print_json
-    from lidarpose.cli.measure_input import measurement_input
+    from lidarpose.cli.measure_input import measurement_view
     from lidarpose.workflows.measuring import measure_disk as measure
 
-    recording, turntable = measurement_input(source, calibration, never_stops)
-    found = measure(recording, turntable, "hole" if hole else "disk")
-    remarks = _remarks(found)
+    view = measurement_view(source, calibration, never_stops)
+    found = measure(view, "hole" if hole else "disk")
+    remarks = [*view.remarks, *_remarks(found[0])]
     if json:
         others = [_document(m) for m in found[1:]]
-        print_json({**_document(found[0]), "frame": "camera", "others": others, "remarks": remarks})
+        print_json({**_document(found[0]), "frame": view.frame, "others": others, "remarks": remarks})
     else:
-        _print(found, remarks)
+        _print(found, view.frame, remarks)
 
 
 def _document(m: RoundMeasurement) -> dict[str, Any]:
@@ -75,11 +75,8 @@ def _document(m: RoundMeasurement) -> dict[str, Any]:
     }
 
 
-def _remarks(found: list[RoundMeasurement]) -> list[str]:
-    best = found[0]
+def _remarks(best: RoundMeasurement) -> list[str]:
     remarks = []
-    if best.calibration_sigma_m is None:
-        remarks.append("the calibration carries no covariance: sigma_mm holds the edge and the plane alone")
     if not best.threshold_known:
         remarks.append(
             "no mixed returns and no fading light at the edge: a beam is taken to be seen if at least half of its spot "
@@ -90,14 +87,14 @@ def _remarks(found: list[RoundMeasurement]) -> list[str]:
     return remarks
 
 
-def _print(found: list[RoundMeasurement], remarks: list[str]) -> None:
+def _print(found: list[RoundMeasurement], frame: str, remarks: list[str]) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     from lidarpose.cli.console import out
 
     table = Table(box=SIMPLE_HEAD)
-    columns = ("", "diameter mm", "± mm", "centre m (camera frame)", "normal", "outermost points mm")
+    columns = ("", "diameter mm", "± mm", f"centre m ({frame} frame)", "normal", "outermost points mm")
     for column in columns:
         table.add_column(column, justify="right")
     for m in found:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.geometry.arrays import FloatArray, IntArray, perpendicular_pair, unit
 from lidarpose.measure.beams import Beams
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.turntable import TurntableMotion
@@ -46,7 +46,9 @@ def recording_from_cloud(
     return best
 
 
-def _gridded(q: FloatArray, psi: FloatArray, motion: TurntableMotion, light: FloatArray | None) -> SweepRecording | None:
+def _gridded(
+    q: FloatArray, psi: FloatArray, motion: TurntableMotion, light: FloatArray | None
+) -> SweepRecording | None:
     c, s = np.cos(psi), np.sin(psi)
     at_zero = np.column_stack([c * q[:, 0] + s * q[:, 1], -s * q[:, 0] + c * q[:, 1], q[:, 2]])
     p = motion.T_turntable_lidar.inverse() @ at_zero
@@ -58,6 +60,9 @@ def _gridded(q: FloatArray, psi: FloatArray, motion: TurntableMotion, light: Flo
         return None
     ranges = np.full((len(psi_levels), len(theta_levels)), np.nan, dtype=np.float32)
     ranges[i, j] = r
+    # Two points of one beam: this is not how the cloud came about.
+    if np.count_nonzero(np.isfinite(ranges)) < 0.99 * len(q):
+        return None
     intensity = None
     if light is not None:
         intensity = np.zeros(ranges.shape, dtype=np.float32)
@@ -116,18 +121,14 @@ def beams_of_cells(points: FloatArray, light: FloatArray | None = None) -> Beams
     from scipy.spatial import cKDTree
 
     r = np.linalg.norm(points, axis=1)
-    middle = points.mean(axis=0)
     # Angles about the mean direction: nothing is singular where the cloud is.
-    from lidarpose.geometry.arrays import perpendicular_pair, unit
-
-    forward = unit(middle)
+    forward = unit(points.mean(axis=0))
     u, v = perpendicular_pair(forward)
     local = np.column_stack([points @ forward, points @ u, points @ v]) / r[:, None]
     azimuth, elevation = np.arctan2(local[:, 1], local[:, 0]), np.arcsin(np.clip(local[:, 2], -1.0, 1.0))
     sample = np.random.default_rng(0).permutation(len(points))[:4000]
-    distance, _ = cKDTree(np.column_stack([azimuth, elevation])).query(
-        np.column_stack([azimuth, elevation])[sample], k=5
-    )
+    angles = np.column_stack([azimuth, elevation])
+    distance = np.asarray(cKDTree(angles).query(angles[sample], k=5)[0])
     # The fourth neighbour of a lattice is one step away along its coarser axis.
     step = float(np.median(distance[:, 4]))
     if not step > 1e-6:

@@ -100,7 +100,9 @@ class EdgeSupport:
     radius: float
 
 
-def measure_round(beams: Beams, sigma: float, kind: Kind, *, seed: int = 0) -> list[RoundMeasurement]:
+def measure_round(
+    beams: Beams, sigma: float, kind: Kind, *, sees_behind: bool = True, seed: int = 0
+) -> list[RoundMeasurement]:
     """All disks (or holes) in a grid of beams, the best determined first.
 
     Parameters
@@ -109,6 +111,9 @@ def measure_round(beams: Beams, sigma: float, kind: Kind, *, seed: int = 0) -> l
         A grid (N, M), in the camera frame.
     sigma
         Range noise, metres.
+    sees_behind
+        False if the viewpoint is not known well enough to say which beam passes the edge: then only the points on the
+        plane count, and gaps between them.
 
     Returns
     -------
@@ -117,10 +122,18 @@ def measure_round(beams: Beams, sigma: float, kind: Kind, *, seed: int = 0) -> l
     found = []
     for patch in find_patches(beams.points, sigma):
         for outline in _outlines(beams, patch, kind, seed):
-            measurement = _measure(beams, patch, outline, sigma, seed)
+            measurement = _measure(
+                beams if sees_behind else _on_plane(beams, patch, sigma), patch, outline, sigma, seed
+            )
             if measurement is not None and measurement.covered > 0.3:
                 found.append(measurement)
     return sorted(found, key=lambda m: -m.covered * np.sqrt(m.edge_beams))
+
+
+def _on_plane(beams: Beams, patch: Patch, sigma: float) -> Beams:
+    """The beams with nothing but what lies on the patch's plane."""
+    on = np.abs(beams.range_m - plane_ranges(patch.plane, beams)) < 6.0 * sigma
+    return replace(beams, range_m=np.where(on, beams.range_m, np.nan))
 
 
 def _outlines(beams: Beams, patch: Patch, kind: Kind, seed: int) -> list[RoundOutline]:

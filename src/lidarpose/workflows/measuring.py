@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,17 +11,98 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.measure.assemble import readings_between
 from lidarpose.measure.beams import Beams, beams_of, chosen_beams, range_noise
+from lidarpose.measure.cloud_beams import beams_of_cells, beams_of_rings, recording_from_cloud
 from lidarpose.measure.disk import RoundMeasurement, measure_round, with_calibration
 from lidarpose.measure.outline import Kind, nothing_round
 from lidarpose.model.calibration import TurntableCalibration
+from lidarpose.model.cloud import Cloud
 from lidarpose.model.recording import SweepRecording
 from lidarpose.workflows.scanning import require_times
 
+# Ranges without any noise are still rounded to float32.
+_LEAST_NOISE_M = 1e-5
 
-def measure_disk(
-    recording: SweepRecording, calibration: TurntableCalibration, kind: Kind = "disk", *, seed: int = 0
-) -> list[RoundMeasurement]:
-    """Disks (or round holes) in a sweep recording, in the camera frame, the best determined first.
+
+@dataclass(frozen=True, eq=False)
+class MeasuringView:
+    """What measuring works from.
+
+    Attributes
+    ----------
+    beams
+        A grid of beams in the frame named by `frame`.
+    noise_m
+        Of a range.
+    sees_behind
+        False if only the object's own points can be trusted: the cloud's viewpoint is not known.
+    covariance, moved
+        The calibration's covariance, and the beams of flat indices under a change of its parameters.
+    remarks
+        What a person should know of it.
+    """
+
+    beams: Beams
+    noise_m: float
+    frame: str
+    sees_behind: bool = True
+    covariance: FloatArray | None = None
+    moved: Callable[[FloatArray, IntArray], Beams] | None = None
+    remarks: tuple[str, ...] = ()
+
+
+def view_of_recording(recording: SweepRecording, calibration: TurntableCalibration) -> MeasuringView:
+    """The beams of a recording in the camera frame.
+
+    Raises
+    ------
+    UndeterminedError
+        If there are too few returns.
+    """
+
+    def moved(change: FloatArray, index: IntArray) -> Beams:
+        return chosen_beams(recording, calibration.motion, index, change)
+
+    beams = beams_of(recording, calibration.motion)
+    remarks: tuple[str, ...] = ()
+    if calibration.motion_covariance is None:
+        remarks = ("the calibration carries no covariance: its share of sigma_mm is not known and not included",)
+    noise = _noise(beams, recording.lidar.range_sigma_m)
+    return MeasuringView(beams, noise, "camera", True, calibration.motion_covariance, moved, remarks)
+
+
+def view_of_cloud(cloud: Cloud, calibration: TurntableCalibration | None) -> MeasuringView:
+    """Beams recovered from a plain cloud: by the turntable's motion, by the LiDAR's rings, or by directions alone.
+
+    Raises
+    ------
+    UndeterminedError
+        If the points give no beams.
+    """
+    keep = np.isfinite(cloud.points).all(axis=1) & (np.abs(cloud.points).max(axis=1, initial=0.0) > 1e-6)
+    points = cloud.points[keep].astype(np.float64)
+    light = None
+    if "intensity" in cloud.fields:
+        light = np.asarray(cloud.fields["intensity"][keep], dtype=np.float64)
+    if len(points) < 100:
+        raise UndeterminedError("The cloud holds too few points to measure anything", remedy="Give a denser cloud.")
+    if calibration is not None:
+        recording = recording_from_cloud(points, calibration.motion, light)
+        if recording is not None:
+            view = view_of_recording(recording, calibration)
+            return replace(view, remarks=(*view.remarks, "the beams were recovered from the cloud by the calibration"))
+    ring = next((cloud.fields[name][keep] for name in ("ring", "line", "channel") if name in cloud.fields), None)
+    beams = beams_of_rings(points, ring, light)
+    if beams is not None:
+        return MeasuringView(beams, _noise(beams, None), cloud.frame or "cloud")
+    beams = beams_of_cells(points, light)
+    if beams is None:
+        raise UndeterminedError("The cloud's points give no grid of beams", remedy="Give the sweep recording instead.")
+    remark = "the cloud does not tell its beams: sizes are good to about half the distance between points"
+    return MeasuringView(beams, _noise(beams, None), cloud.frame or "cloud", False, remarks=(remark,))
+
+
+def measure_disk(view: MeasuringView, kind: Kind = "disk", *, seed: int = 0) -> list[RoundMeasurement]:
+    """Disks (or round holes), the best determined first.
 
     Source: the turntable paper, section 3.2, with the edge estimated from where beams stop hitting it instead of the
     outermost points.
@@ -30,32 +112,12 @@ def measure_disk(
     UndeterminedError
         If nothing round is found.
     """
-    sigma = recording_noise(recording)
-    found = measure_round(beams_of(recording, calibration.motion), sigma, kind, seed=seed)
+    found = measure_round(view.beams, view.noise_m, kind, sees_behind=view.sees_behind, seed=seed)
     if not found:
         raise nothing_round(kind)
-    if calibration.motion_covariance is None:
+    if view.covariance is None or view.moved is None:
         return found
-
-    def moved(change: FloatArray, index: IntArray) -> Beams:
-        return chosen_beams(recording, calibration.motion, index, change)
-
-    return [with_calibration(m, moved, calibration.motion_covariance) for m in found]
-
-
-def recording_noise(recording: SweepRecording) -> float:
-    """Range noise of a recording, metres: measured in it, or as its head file says where it is too small for that."""
-    sigma = range_noise(np.where(recording.has_return(), np.asarray(recording.range_m, dtype=np.float64), np.nan))
-    # Recordings without any noise (simulated ones) are still rounded to float32.
-    smallest = 1e-5
-    if np.isfinite(sigma):
-        return max(sigma, smallest)
-    if recording.lidar.range_sigma_m is not None:
-        return recording.lidar.range_sigma_m
-    raise UndeterminedError(
-        "The recording holds too few returns to measure anything",
-        remedy="Record at least eight sweeps with eight beams each on the object.",
-    )
+    return [with_calibration(m, view.moved, view.covariance) for m in found]
 
 
 def with_readings_between(recording: SweepRecording) -> SweepRecording:
@@ -68,3 +130,16 @@ def with_readings_between(recording: SweepRecording) -> SweepRecording:
     """
     require_times(recording)
     return replace(recording, turntable_angle_deg=readings_between(recording))
+
+
+def _noise(beams: Beams, stated_m: float | None) -> float:
+    """Range noise: measured in the beams, or as stated where they are too few for that."""
+    sigma = range_noise(beams.range_m)
+    if np.isfinite(sigma):
+        return max(sigma, _LEAST_NOISE_M)
+    if stated_m is not None:
+        return stated_m
+    raise UndeterminedError(
+        "There are too few returns side by side to measure anything",
+        remedy="Record at least eight sweeps with eight beams each on the object.",
+    )
