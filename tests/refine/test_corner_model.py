@@ -213,7 +213,12 @@ def test_one_places_corner_and_its_frames() -> None:
     rng = np.random.default_rng(9)
     places = observe(beams(400, rng), rng)
     normals, true = TRUTH.inverse().rotate(NORMALS_WORLD), TRUTH.inverse() @ WORLD[0]
-    corner, found, sigma = fit_corner(places[0].faces, start().normals, true + 0.02, SIGMA_M)
+    alone = fit_corner(places[0].faces, start().normals, true + 0.02, SIGMA_M)
+    corner, found, sigma = alone.corner, alone.normals, alone.sigma_m
+    worst, statistic = alone.turn_statistic(normals)
+    assert worst < 0.01
+    assert statistic < 25.0
+    assert alone.turn_statistic((exp_so3([0.0, 0.0, 0.03]) @ normals.T).T)[1] > 60.0
     assert np.linalg.norm(corner - true) < 0.005
     assert np.abs(found - normals).max() < 0.01
     assert sigma == pytest.approx(SIGMA_M, rel=0.1)
@@ -221,11 +226,11 @@ def test_one_places_corner_and_its_frames() -> None:
     assert np.isnan(by_frame[4]).all()
     assert np.abs(by_frame[:4] - true).max() < 0.02
     # A frame by itself: three free planes through its returns alone.
-    alone = {
+    frame = {
         j: FaceReturns(f.directions[f.frame == 2], f.range_m[f.frame == 2], f.frame[f.frame == 2])
         for j, f in places[0].faces.items()
     }
-    np.testing.assert_allclose(by_frame[2], fit_corner(alone, found, corner, sigma)[0], atol=3e-4)
+    np.testing.assert_allclose(by_frame[2], fit_corner(frame, found, corner, sigma).corner, atol=3e-4)
 
 
 def test_fit_result_names_its_parameters() -> None:

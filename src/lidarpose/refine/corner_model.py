@@ -165,10 +165,27 @@ def _wide_enough(sigma_m: float, residuals: Sequence[FloatArray]) -> float:
     return max(sigma_m, MIN_SIGMA_M, *(mad_sigma(r, centred=True) for r in residuals))
 
 
-def fit_corner(
-    faces: Mapping[int, FaceReturns], normals: FloatArray, corner: FloatArray, sigma_m: float
-) -> tuple[FloatArray, FloatArray, float]:
-    """Three free planes through one place's returns: corner (3,), normals (3, 3), range noise (m).
+@dataclass(frozen=True, eq=False)
+class FreeCorner:
+    """Three free planes at one place: corner (3,), normals (3, 3), range noise, information (3, 2, 2) of the tilts."""
+
+    corner: FloatArray
+    normals: FloatArray
+    sigma_m: float
+    tilt_information: FloatArray
+
+    def turn_statistic(self, normals: FloatArray) -> tuple[float, float]:
+        """How far other normals (3, 3) are: the largest tilt in radians, and a chi-square of six degrees of freedom."""
+        total, worst = 0.0, 0.0
+        for own, other, information in zip(self.normals, normals, self.tilt_information, strict=True):
+            tilt = tangents(own).T @ (other - own)
+            worst = max(worst, float(np.linalg.norm(tilt)))
+            total += float(tilt @ information @ tilt)
+        return worst, total
+
+
+def fit_corner(faces: Mapping[int, FaceReturns], normals: FloatArray, corner: FloatArray, sigma_m: float) -> FreeCorner:
+    """Three free planes through one place's returns.
 
     Parameters
     ----------
@@ -185,11 +202,12 @@ def fit_corner(
     first = [face_residuals(faces[j], normals[j], corner) for j in range(3)]
     sigma_m = _wide_enough(sigma_m, first)
     for _ in range(MAX_STEPS):
-        residuals, moves = [], []
+        residuals, moves, tilts = [], [], []
         for j in range(3):
             face = _Face(0, j, faces[j].directions, faces[j].range_m)
             system = _system(face, normals[j], corner, sigma_m)
             residuals.append(face.residual)
+            tilts.append(_without_first(system.information))
             moves.append(_solve(system.information, system.gradient, f"face {j + 1} of the target"))
         tilted = np.stack([unit(n + tangents(n) @ m[1:]) for n, m in zip(normals, moves, strict=True)])
         shift = np.linalg.solve(tilted, [m[0] for m in moves])
@@ -197,7 +215,13 @@ def fit_corner(
         sigma_m = max(mad_sigma(np.concatenate(residuals), centred=True), MIN_SIGMA_M)
         if np.linalg.norm(shift) < 1e-7:
             break
-    return corner, normals, sigma_m
+    return FreeCorner(corner, normals, sigma_m, np.stack(tilts))
+
+
+def _without_first(information: FloatArray) -> FloatArray:
+    """Information (2, 2) of the last two of three unknowns, the first being free."""
+    cross = information[1:, 0]
+    return np.asarray(information[1:, 1:] - np.outer(cross, cross) / max(float(information[0, 0]), 1e-300))
 
 
 def _solve(information: FloatArray, gradient: FloatArray, what: str) -> FloatArray:

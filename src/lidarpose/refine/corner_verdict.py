@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
 
@@ -19,8 +19,10 @@ from lidarpose.refine.corner_model import CornerFit, direction_cells, face_resid
 
 GOOD_ROTATION_DEG, GOOD_POSITION_MM = 0.1, 5.0
 USABLE_ROTATION_DEG, USABLE_POSITION_MM = 1.0, 50.0
-# A turn of the target: far beyond chance (three degrees of freedom) and large enough to matter.
+# A turn of the target: far beyond chance (three degrees of freedom, six where a place stands by itself) and large
+# enough to matter.
 TURN_STATISTIC, TURN_DEG = 30.0, 0.2
+OWN_TURN_STATISTIC, OWN_TURN_DEG = 60.0, 0.3
 # World coordinates that disagree by more than this with one another are no measurement.
 WORLD_SIGMA_DOUBTFUL_MM = 10.0
 NOISE_RATIO_DOUBTFUL = 3.0
@@ -38,6 +40,7 @@ class CornerEvidence:
     stated_range_sigma_m: float | None
     cloud_frame: CloudFrame
     frame_scatter_m: Mapping[str, FloatArray]
+    turns: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 class _Verdict:
@@ -61,8 +64,9 @@ def judge_corner_fit(fit: CornerFit, places: Sequence[CornerPlaceFaces], evidenc
     """Verdict on the joint estimate, with reasons and figures."""
     verdict = _Verdict()
     factor = _common_error_factor(fit, places)
-    corners = fit.state.corners(fit.world)
     moves, statistic, known = place_discrepancies(fit)
+    # Each place's corner by its own returns, at the common orientation: what the world coordinates are held against.
+    corners = fit.state.scale * (fit.state.corners(fit.world) + np.where(known[:, None], moves[:, :3], 0.0))
     figures = _figures(fit.state.T_world_lidar, fit.pose_covariance * factor, evidence)
     figures |= {
         "range_sigma_mm": 1e3 * fit.range_sigma_m,
@@ -76,7 +80,7 @@ def judge_corner_fit(fit: CornerFit, places: Sequence[CornerPlaceFaces], evidenc
     if "log_scale" in fit.names:
         figures["scale_sigma"] = float(np.sqrt(fit.covariance[6, 6] * factor)) * fit.state.scale
     _judge_common(verdict, fit.state.T_world_lidar, fit.world, corners, figures, evidence)
-    _judge_turns(verdict, places, moves, statistic, known)
+    _judge_turns(verdict, places, moves, statistic, known, evidence)
     _judge_world(verdict, fit, places, evidence)
     _judge_noise(verdict, fit, evidence)
     return Quality(verdict.verdict, tuple(verdict.reasons), figures)
@@ -130,6 +134,8 @@ def _judge_common(
             verdict.doubt(f"{item.what} is left out: {item.reason}")
     _judge_handedness(verdict, pose, world, lidar, evidence)
     _judge_swaps(verdict, pose, world, lidar, evidence)
+    _judge_scale(verdict, pose, world, lidar)
+    _judge_single_places(verdict, world, lidar, evidence)
     rotation, position = figures["sigma_rotation_deg"], figures["sigma_position_mm"]
     layout = _layout_remark(world)
     if not (rotation <= USABLE_ROTATION_DEG and position <= USABLE_POSITION_MM):
@@ -188,22 +194,60 @@ def _judge_swaps(verdict: _Verdict, pose: Pose, world: FloatArray, lidar: FloatA
             return
 
 
+def _judge_scale(verdict: _Verdict, pose: Pose, world: FloatArray, lidar: FloatArray) -> None:
+    """A misfit that another scale removes: tape and LiDAR disagree about the metre."""
+    cw, cp = world - world.mean(axis=0), lidar - lidar.mean(axis=0)
+    turned = cp @ nearest_rotation(cw.T @ cp).T
+    scale = float((cw * turned).sum() / (turned * turned).sum())
+    misfit = _rms(cw - turned)
+    if misfit > 0.005 and len(world) > 3 and _rms(cw - scale * turned) < 0.3 * misfit:
+        verdict.doubt(
+            f"distances between the world coordinates are {scale:.4f} times those between the corners: check the "
+            "unit, or ask for the scale as well"
+        )
+
+
+def _judge_single_places(verdict: _Verdict, world: FloatArray, lidar: FloatArray, evidence: CornerEvidence) -> None:
+    """A single place that disagrees with all others about its own coordinates."""
+    if len(world) < 5:
+        return
+    worst: tuple[float, str] | None = None
+    for k, position in enumerate(evidence.positions):
+        others = np.arange(len(world)) != k
+        mean_w, mean_p = world[others].mean(axis=0), lidar[others].mean(axis=0)
+        R = nearest_rotation((world[others] - mean_w).T @ (lidar[others] - mean_p))
+        rest = _rms(world[others] - mean_w - (lidar[others] - mean_p) @ R.T)
+        miss = float(np.linalg.norm(world[k] - mean_w - R @ (lidar[k] - mean_p)))
+        if miss > 8.0 * rest + 0.005 and (worst is None or miss > worst[0]):
+            worst = miss, position
+    if worst is not None:
+        verdict.doubt(f"the world coordinates of {worst[1]} are {1e3 * worst[0]:.0f} mm from where the others put it")
+
+
 def _judge_turns(
     verdict: _Verdict,
     places: Sequence[CornerPlaceFaces],
     moves: FloatArray,
     statistic: FloatArray,
     known: BoolArray,
+    evidence: CornerEvidence,
 ) -> None:
-    if not known.any():
-        return
+    """Places whose faces are turned against the others', by the joint estimate or by their own planes."""
     turn_deg = np.degrees(np.linalg.norm(moves[:, 3:], axis=1))
-    suspects = known & (statistic > TURN_STATISTIC) & (turn_deg > TURN_DEG)
-    if suspects.any():
-        worst = int(np.argmax(np.where(suspects, turn_deg, 0.0)))
+    suspects = {
+        p.position: float(turn)
+        for p, turn, chance, sure in zip(places, turn_deg, statistic, known, strict=True)
+        if sure and chance > TURN_STATISTIC and turn > TURN_DEG
+    }
+    for position, (tilt_rad, chance) in evidence.turns.items():
+        tilt_deg = float(np.degrees(tilt_rad))
+        if chance > OWN_TURN_STATISTIC and tilt_deg > OWN_TURN_DEG:
+            suspects[position] = max(tilt_deg, suspects.get(position, 0.0))
+    if suspects:
+        worst = max(suspects, key=lambda p: suspects[p])
         verdict.doubt(
-            f"the target seems turned by {turn_deg[worst]:.1f} deg at {places[worst].position} against the other "
-            "places; it must keep its orientation"
+            f"the target seems turned by {suspects[worst]:.1f} deg at {worst} against the other places; it must keep "
+            "its orientation"
         )
 
 

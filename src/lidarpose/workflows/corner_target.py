@@ -16,7 +16,7 @@ from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import NEAR_RADIUS_M, CloudSource, CornerPlace, CornerSession
 from lidarpose.model.observation import LeftOut
-from lidarpose.refine.corner_model import direction_cells, face_residuals, fit_corner
+from lidarpose.refine.corner_model import FreeCorner, direction_cells, face_residuals, fit_corner
 from lidarpose.solve.corner_matching import CornerMatch, match_corners
 
 # A hint is right within 0.3 m, and a target no larger than this beyond the corner.
@@ -290,18 +290,10 @@ def _second_screening(returns: FaceReturns, normal: FloatArray, corner: FloatArr
     return FaceReturns(returns.directions[keep], returns.range_m[keep], returns.frame[keep])
 
 
-@dataclass(frozen=True, eq=False)
-class PlaceFit:
-    """One place by itself: the corner (3,), normals (3, 3) and range noise of three free planes."""
-
-    corner: FloatArray
-    normals: FloatArray
-    sigma_m: float
-
-
-def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> PlaceFit | None:
+def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> FreeCorner | None:
     """Three free planes at one place, selected and fitted in turn; None where they do not settle."""
     corner, normals = sighting.corner, sighting.normals
+    fit: FreeCorner | None = None
     gate_m = max(FIRST_GATE_M, GATE_SIGMAS * sigma_m)
     try:
         for step in range(5):
@@ -310,13 +302,12 @@ def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> Pla
             faces = select_faces(crop, mask, gate_m, None if inner else sigma_m)
             if len(faces) < 3:
                 return None
-            corner, normals, sigma_m = fit_corner(faces, normals, corner, sigma_m)
+            fit = fit_corner(faces, normals, corner, sigma_m)
+            corner, normals, sigma_m = fit.corner, fit.normals, fit.sigma_m
             gate_m = min(gate_m, max(GATE_SIGMAS * sigma_m, 0.002))
     except UndeterminedError:
         return None
-    if np.linalg.norm(corner - sighting.corner) > 0.15:
-        return None
-    return PlaceFit(corner, normals, sigma_m)
+    return fit if np.linalg.norm(corner - sighting.corner) < 0.15 else None
 
 
 def observe(

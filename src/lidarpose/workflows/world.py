@@ -21,6 +21,7 @@ from lidarpose.refine.corner_model import (
     CornerFit,
     CornerOptions,
     CornerState,
+    FreeCorner,
     estimate_world_sigma,
     fit_corner_model,
     frame_corners,
@@ -31,7 +32,6 @@ from lidarpose.solve.corner_matching import face_order
 from lidarpose.workflows.corner_target import (
     FoundTarget,
     PlaceCrop,
-    PlaceFit,
     Tick,
     find_target,
     fit_place,
@@ -108,7 +108,7 @@ def _joint(session: CornerSession, found: FoundTarget, crops: Sequence[PlaceCrop
     places, frame_scatter, dropped = _without_odd_frames(places, corners, start.normals, sigma_m)
     fit, used = _fit(mended, places, start, sigma_m, scale_too)
     # Once more with the faces' beams selected by the estimate itself.
-    corners = fit.state.corners(found.world)
+    corners = _expected(fit, places, found.world)
     places, left_out = observe(mended, found, crops, corners, fit.state.normals, fit.range_sigma_m)
     places, frame_scatter, dropped = _without_odd_frames(places, corners, fit.state.normals, fit.range_sigma_m)
     fit, used = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too)
@@ -121,6 +121,7 @@ def _joint(session: CornerSession, found: FoundTarget, crops: Sequence[PlaceCrop
         session.lidar.range_sigma_m,
         session.cloud_frame,
         frame_scatter,
+        _turns(session, fits, fit.state.normals),
     )
     quality = judge_corner_fit(fit, used, evidence)
     return WorldCalibration(
@@ -133,6 +134,20 @@ def _joint(session: CornerSession, found: FoundTarget, crops: Sequence[PlaceCrop
         quality,
         _provenance(session, "joint"),
     )
+
+
+def _expected(fit: CornerFit, places: Sequence[CornerPlaceFaces], world: FloatArray) -> FloatArray:
+    """The corners (P, 3) of all places by an estimate from those that have faces."""
+    errors = np.zeros_like(world)
+    errors[[i for i, p in enumerate(places) if p.faces]] = fit.state.world_errors
+    return replace(fit.state, world_errors=errors).corners(world)
+
+
+def _turns(
+    session: CornerSession, fits: Sequence[FreeCorner | None], normals: FloatArray
+) -> dict[str, tuple[float, float]]:
+    """By place: how far its own faces are turned from the common ones, and how surely."""
+    return {p.position: f.turn_statistic(normals) for p, f in zip(session.places, fits, strict=True) if f is not None}
 
 
 def _as_used(covariance: FloatArray, figures: Mapping[str, Any]) -> FloatArray:
@@ -153,7 +168,7 @@ def _provenance(session: CornerSession, method: str) -> dict[str, Any]:
     }
 
 
-def _place_fits(session: CornerSession, found: FoundTarget, crops: Sequence[PlaceCrop]) -> list[PlaceFit | None]:
+def _place_fits(session: CornerSession, found: FoundTarget, crops: Sequence[PlaceCrop]) -> list[FreeCorner | None]:
     first_guess = session.lidar.range_sigma_m
     return [
         None if s is None else fit_place(crop, s, first_guess or 2.0 * s.sigma_m)
@@ -161,7 +176,7 @@ def _place_fits(session: CornerSession, found: FoundTarget, crops: Sequence[Plac
     ]
 
 
-def _start(session: CornerSession, fits: Sequence[PlaceFit | None]) -> tuple[CornerState, float]:
+def _start(session: CornerSession, fits: Sequence[FreeCorner | None]) -> tuple[CornerState, float]:
     """The closed form on the corners of the places that stand by themselves."""
     known = [(p, f) for p, f in zip(session.places, fits, strict=True) if f is not None]
     if len(known) < 3:
@@ -180,7 +195,7 @@ def _start(session: CornerSession, fits: Sequence[PlaceFit | None]) -> tuple[Cor
     return CornerState(svd_pose(world, lidar), normals, 1.0, errors), sigma_m
 
 
-def _corners(start: CornerState, fits: Sequence[PlaceFit | None], found: FoundTarget) -> FloatArray:
+def _corners(start: CornerState, fits: Sequence[FreeCorner | None], found: FoundTarget) -> FloatArray:
     predicted = start.corners(found.world)
     return np.stack([p if f is None else f.corner for f, p in zip(fits, predicted, strict=True)])
 
