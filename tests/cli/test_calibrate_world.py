@@ -16,10 +16,11 @@ def test_simulate_then_calibrate(tmp_path: Path, capsys: pytest.CaptureFixture[s
     session = tmp_path / "session"
     assert run(["simulate", "corners", str(session), "--frames", "3", "--places", "4", "--clutter", "4"]) == 0
     capsys.readouterr()
-    calibrate_world_session(session, tmp_path / "out", json=True)
+    assert run(["calibrate", str(session), "-o", str(tmp_path / "out"), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["kind"] == "world"
-    assert printed["quality"]["verdict"] == "good"
+    assert printed["verdict"] == "good"
+    assert printed["error_against_truth"]["position_mm"] < 3.0
     truth = json.loads(Path(f"{session}.truth.json").read_text())
     metres, radians = read_world_calibration(tmp_path / "out" / "calibration.json").T_world_source.distance(
         Pose.from_matrix(truth["transforms"][0]["matrix"])
@@ -44,4 +45,21 @@ def test_places_on_one_line_are_refused(tmp_path: Path) -> None:
     table.write_text("\n".join([lines[0], *(",".join(row) for row in rows)]) + "\n")
     with pytest.raises(UndeterminedError, match="on one line"):
         calibrate_world_session(session, tmp_path / "out")
+    assert run(["calibrate", str(session), "-o", str(tmp_path / "out")]) == 1
     assert not (tmp_path / "out" / "calibration.json").exists()
+
+
+def test_millimetres_are_named_and_end_in_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    session = tmp_path / "session"
+    assert run(["simulate", "corners", str(session), "--frames", "1", "--places", "4", "--suffix", ".npy"]) == 0
+    table = session / "positions.csv"
+    lines = table.read_text().splitlines()
+    rows = [line.split(",") for line in lines[1:]]
+    for row in rows:
+        row[1:4] = [str(1000.0 * float(x)) for x in row[1:4]]
+    table.write_text("\n".join([lines[0], *(",".join(row) for row in rows)]) + "\n")
+    assert run(["calibrate", str(session), "-o", str(tmp_path / "out")]) == 1
+    assert "millimetres" in capsys.readouterr().err
+    quality = read_world_calibration(tmp_path / "out" / "calibration.json").quality
+    assert quality is not None
+    assert quality.verdict == "rejected"

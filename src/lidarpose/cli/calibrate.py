@@ -69,7 +69,7 @@ def calibrate(
 
     found = session_format(session)
     if found == CORNER_SESSION_FORMAT:
-        _calibrate_corners(session, output, method, estimate_scale=estimate_scale, json=json, quiet=quiet)
+        _calibrate_corners(session, output, method, estimate_scale, want_mm, want_deg, json=json, quiet=quiet)
         return
     if found != SESSION_FORMAT:
         expected = f'"{SESSION_FORMAT}" or "{CORNER_SESSION_FORMAT}"'
@@ -89,12 +89,27 @@ def calibrate(
 
 
 def _calibrate_corners(
-    session: Path, output: Path, method: str, *, estimate_scale: bool, json: bool, quiet: bool
+    session: Path,
+    output: Path,
+    method: str,
+    estimate_scale: bool,
+    want_mm: float | None,
+    want_deg: float | None,
+    *,
+    json: bool,
+    quiet: bool,
 ) -> None:
     from lidarpose.cli.calibrate_world import calibrate_world_session
 
     calibration = calibrate_world_session(
-        session, output, method=method, estimate_scale=estimate_scale or None, json=json, quiet=quiet
+        session,
+        output,
+        method=method,
+        estimate_scale=estimate_scale or None,
+        want_mm=want_mm,
+        want_deg=want_deg,
+        json=json,
+        quiet=quiet,
     )
     _refuse_if_rejected(calibration.quality)
 

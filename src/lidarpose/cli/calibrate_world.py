@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from lidarpose.geometry.se3 import Pose
     from lidarpose.model.calibration import WorldCalibration
     from lidarpose.model.corner_session import CornerSession
 
@@ -18,6 +19,8 @@ def calibrate_world_session(
     *,
     method: str = "joint",
     estimate_scale: bool | None = None,
+    want_mm: float | None = None,
+    want_deg: float | None = None,
     seed: int = 0,
     json: bool = False,
     quiet: bool = False,
@@ -34,6 +37,8 @@ def calibrate_world_session(
         One of `WORLD_METHODS`.
     estimate_scale
         Overrules the session's own `estimate_scale`, if given.
+    want_mm, want_deg
+        Standard deviations that are good enough, in place of 5 mm and 0.1 degrees.
     seed
         For the random choices of detection.
     json
@@ -49,39 +54,72 @@ def calibrate_world_session(
     from lidarpose.cli.console import progress
     from lidarpose.errors import InputError
     from lidarpose.storage.calibration import write_calibration
-    from lidarpose.storage.corner_session import read_corner_session
+    from lidarpose.storage.corner_session import read_corner_session, session_provenance, truth_beside
     from lidarpose.workflows.world import calibrate_world
 
     methods = {name: name for name in WORLD_METHODS}
     if method not in methods:
         raise InputError("--method", f"is {method!r}", expected="for a corner session: " + ", ".join(WORLD_METHODS))
     session = read_corner_session(session_folder)
+    options = {
+        "method": method,
+        "estimate_scale": estimate_scale,
+        "want_mm": want_mm,
+        "want_deg": want_deg,
+        "seed": seed,
+    }
     steps = len(session.places) + sum(len(p.clouds) for p in session.places)
     with progress("Reading clouds", steps, quiet=quiet or json) as advance:
         calibration = calibrate_world(
             session,
             method,  # type: ignore[arg-type]
             estimate_scale=estimate_scale,
+            wishes={k: v for k, v in (("want_mm", want_mm), ("want_deg", want_deg)) if v is not None},
             seed=seed,
+            provenance=session_provenance(session_folder, session, options),
             tick=lambda: advance(),
         )
     file = output / "calibration.json"
     write_calibration(file, calibration)
-    _print_result(calibration, file, json)
+    _print_result(calibration, truth_beside(session_folder), file, json)
     return calibration
 
 
-def _print_result(calibration: WorldCalibration, file: Path, json: bool) -> None:
+def _print_result(calibration: WorldCalibration, truth: Pose | None, file: Path, json: bool) -> None:
     from lidarpose.cli.console import out, print_json
-    from lidarpose.storage.calibration import calibration_document
 
     if json:
-        print_json(calibration_document(calibration))
+        print_json(summary(calibration, truth))
         return
     console = out()
     for line in summary_lines(calibration):
         console.print(line)
+    if truth is not None:
+        metres, radians = calibration.T_world_source.distance(truth)
+        console.print(
+            f"error against the truth beside the session: {1e3 * metres:.3f} mm, {radians * 57.29578:.4f} deg"
+        )
     console.print(f"written to {file}")
+
+
+def summary(calibration: WorldCalibration, truth: Pose | None) -> dict[str, Any]:
+    """The result as a JSON object; units in the keys."""
+    from lidarpose.storage.calibration import transform_entry
+
+    quality = calibration.quality
+    document: dict[str, Any] = {
+        "kind": "world",
+        "method": calibration.provenance.get("method"),
+        "verdict": quality.verdict if quality else None,
+        "reasons": list(quality.reasons) if quality else [],
+        "transform": transform_entry("world", calibration.source, calibration.T_world_source, calibration.covariance),
+        "scale": calibration.scale,
+        **(quality.figures if quality else {}),
+    }
+    if truth is not None:
+        metres, radians = calibration.T_world_source.distance(truth)
+        document["error_against_truth"] = {"position_mm": 1e3 * metres, "rotation_deg": radians * 57.29577951308232}
+    return document
 
 
 def summary_lines(calibration: WorldCalibration) -> list[str]:

@@ -17,8 +17,6 @@ from lidarpose.model.corner_session import CloudFrame
 from lidarpose.model.observation import LeftOut
 from lidarpose.refine.corner_model import CornerFit, direction_cells, face_residuals, place_discrepancies
 
-GOOD_ROTATION_DEG, GOOD_POSITION_MM = 0.1, 5.0
-USABLE_ROTATION_DEG, USABLE_POSITION_MM = 1.0, 50.0
 # A turn of the target: far beyond chance (three degrees of freedom, six where a place stands by itself) and large
 # enough to matter.
 TURN_STATISTIC, TURN_DEG = 30.0, 0.2
@@ -43,6 +41,14 @@ class CornerEvidence:
     turns: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class PrecisionLimits:
+    """Standard deviations (worst direction) that are good enough; ten times as much is rejected."""
+
+    want_mm: float = 5.0
+    want_deg: float = 0.1
+
+
 class _Verdict:
     """Collects reasons; the worst decides."""
 
@@ -60,7 +66,9 @@ class _Verdict:
         self.reasons.append(reason)
 
 
-def judge_corner_fit(fit: CornerFit, places: Sequence[CornerPlaceFaces], evidence: CornerEvidence) -> Quality:
+def judge_corner_fit(
+    fit: CornerFit, places: Sequence[CornerPlaceFaces], evidence: CornerEvidence, limits: PrecisionLimits
+) -> Quality:
     """Verdict on the joint estimate, with reasons and figures."""
     verdict = _Verdict()
     factor = _common_error_factor(fit, places)
@@ -79,7 +87,7 @@ def judge_corner_fit(fit: CornerFit, places: Sequence[CornerPlaceFaces], evidenc
     }
     if "log_scale" in fit.names:
         figures["scale_sigma"] = float(np.sqrt(fit.covariance[6, 6] * factor)) * fit.state.scale
-    _judge_common(verdict, fit.state.T_world_lidar, fit.world, corners, figures, evidence)
+    _judge_common(verdict, fit.state.T_world_lidar, fit.world, corners, figures, evidence, limits)
     _judge_turns(verdict, places, moves, statistic, known, evidence)
     _judge_world(verdict, fit, places, evidence)
     _judge_noise(verdict, fit, evidence)
@@ -87,7 +95,12 @@ def judge_corner_fit(fit: CornerFit, places: Sequence[CornerPlaceFaces], evidenc
 
 
 def judge_corners(
-    T_world_lidar: Pose, world: FloatArray, lidar: FloatArray, covariance: FloatArray, evidence: CornerEvidence
+    T_world_lidar: Pose,
+    world: FloatArray,
+    lidar: FloatArray,
+    covariance: FloatArray,
+    evidence: CornerEvidence,
+    limits: PrecisionLimits,
 ) -> Quality:
     """Verdict on a pose from corners alone (the paper's methods)."""
     verdict = _Verdict()
@@ -95,7 +108,7 @@ def judge_corners(
     residual = T_world_lidar @ lidar - world
     figures["corner_rms_mm"] = 1e3 * float(np.sqrt((residual**2).sum(axis=1).mean()))
     figures["places_used"] = len(world)
-    _judge_common(verdict, T_world_lidar, world, lidar, figures, evidence)
+    _judge_common(verdict, T_world_lidar, world, lidar, figures, evidence, limits)
     if figures["corner_rms_mm"] > 30.0:
         verdict.doubt(f"the corners miss their world coordinates by {figures['corner_rms_mm']:.0f} mm RMS")
     return Quality(verdict.verdict, tuple(verdict.reasons), figures)
@@ -126,6 +139,7 @@ def _judge_common(
     lidar: FloatArray,
     figures: dict[str, Any],
     evidence: CornerEvidence,
+    limits: PrecisionLimits,
 ) -> None:
     if evidence.oddity:
         verdict.reject(evidence.oddity)
@@ -138,9 +152,9 @@ def _judge_common(
     _judge_single_places(verdict, world, lidar, evidence)
     rotation, position = figures["sigma_rotation_deg"], figures["sigma_position_mm"]
     layout = _layout_remark(world)
-    if not (rotation <= USABLE_ROTATION_DEG and position <= USABLE_POSITION_MM):
+    if not (rotation <= 10.0 * limits.want_deg and position <= 10.0 * limits.want_mm):
         verdict.reject(f"the pose is known to {rotation:.2g} deg and {position:.2g} mm only{layout}")
-    elif not (rotation <= GOOD_ROTATION_DEG and position <= GOOD_POSITION_MM):
+    elif not (rotation <= limits.want_deg and position <= limits.want_mm):
         verdict.doubt(f"the pose is known to {rotation:.2g} deg and {position:.2g} mm{layout}")
 
 

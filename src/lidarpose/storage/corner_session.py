@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
@@ -12,10 +12,14 @@ from pydantic import Field
 
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.se3 import Pose
+from lidarpose.model.calibration import WorldCalibration
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.corner_session import CornerPlace, CornerSession
 from lidarpose.storage.atomic import write_text
+from lidarpose.storage.calibration import read_calibration
 from lidarpose.storage.documents import Schema, check_format, parse, read_toml
+from lidarpose.storage.provenance import provenance
 from lidarpose.storage.session import LidarSection, inside
 from lidarpose.storage.tables import TextTable, read_text_table
 
@@ -179,6 +183,24 @@ def _session_toml(session: CornerSession) -> str:
     if session.lidar.range_sigma_m is not None:
         lines.append(f"range_sigma_m = {session.lidar.range_sigma_m:.9g}")
     return "\n".join(lines) + "\n"
+
+
+def session_provenance(folder: Path, session: CornerSession, options: Mapping[str, Any]) -> dict[str, Any]:
+    """A record of a run on a session: hashes of its description; of the clouds, which are large, number and size."""
+    document = parse(folder / "session.toml", _SessionFile, read_toml(folder / "session.toml"))
+    record = provenance("calibrate", folder, [folder / "session.toml", folder / document.positions], options)
+    clouds = [source for place in session.places for source in place.clouds]
+    sizes = [source.path.stat().st_size for source in clouds if isinstance(source, FileCloud)]
+    return record | {"clouds": {"files": len(clouds), "bytes": sum(sizes)}}
+
+
+def truth_beside(folder: Path) -> Pose | None:
+    """The true pose that a simulation left beside its session, as FOLDER.truth.json; None where there is none."""
+    file = folder.with_name(folder.name + ".truth.json")
+    if not file.is_file():
+        return None
+    calibration = read_calibration(file)
+    return calibration.T_world_source if isinstance(calibration, WorldCalibration) else None
 
 
 def corner_truth_document(transform: dict[str, Any], positions: list[dict[str, Any]]) -> dict[str, Any]:

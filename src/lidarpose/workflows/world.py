@@ -26,7 +26,13 @@ from lidarpose.refine.corner_model import (
     fit_corner_model,
     frame_corners,
 )
-from lidarpose.refine.corner_verdict import CornerEvidence, cornerwise_covariance, judge_corner_fit, judge_corners
+from lidarpose.refine.corner_verdict import (
+    CornerEvidence,
+    PrecisionLimits,
+    cornerwise_covariance,
+    judge_corner_fit,
+    judge_corners,
+)
 from lidarpose.solve.corner_alignment import cayley_pose, pair_scale, svd_pose
 from lidarpose.solve.corner_matching import face_order
 from lidarpose.workflows.corner_target import (
@@ -54,7 +60,9 @@ def calibrate_world(
     method: WorldMethod = "joint",
     *,
     estimate_scale: bool | None = None,
+    wishes: Mapping[str, float] | None = None,
     seed: int = 0,
+    provenance: Mapping[str, Any] | None = None,
     tick: Tick = lambda: None,
 ) -> WorldCalibration:
     """The pose of the clouds' frame in the world.
@@ -69,6 +77,10 @@ def calibrate_world(
         optimisation; `ransac`, plain RANSAC planes of single frames; `harris`, 3D Harris corners.
     estimate_scale
         Also estimate the factor of eq. (2); by default what the session says.
+    wishes
+        `want_mm` and `want_deg`, standard deviations that are good enough.
+    provenance
+        What to record of the run in the calibration, beside method and counts.
     tick
         Called once for each frame read or searched.
 
@@ -88,9 +100,12 @@ def calibrate_world(
             remedy="Tell which is the target's by near_x_m,near_y_m,near_z_m in the table of positions.",
         )
     crops = gather(session, found, tick=tick)
+    limits = PrecisionLimits(**(wishes or {}))
     if method == "joint":
-        return _joint(session, found, crops, scale_too)
-    return _cornerwise(session, found, crops, method, scale_too, seed)
+        calibration = _joint(session, found, crops, scale_too, limits)
+    else:
+        calibration = _cornerwise(session, found, crops, method, scale_too, limits, seed)
+    return replace(calibration, provenance={**(provenance or {}), **calibration.provenance})
 
 
 def _usable_world(session: CornerSession, found: FoundTarget) -> CornerSession:
@@ -99,7 +114,13 @@ def _usable_world(session: CornerSession, found: FoundTarget) -> CornerSession:
     return replace(session, places=places)
 
 
-def _joint(session: CornerSession, found: FoundTarget, crops: Sequence[PlaceCrop], scale_too: bool) -> WorldCalibration:
+def _joint(
+    session: CornerSession,
+    found: FoundTarget,
+    crops: Sequence[PlaceCrop],
+    scale_too: bool,
+    limits: PrecisionLimits,
+) -> WorldCalibration:
     mended = _usable_world(session, found)
     fits = _place_fits(session, found, crops)
     start, sigma_m = _start(mended, fits)
@@ -123,7 +144,7 @@ def _joint(session: CornerSession, found: FoundTarget, crops: Sequence[PlaceCrop
         frame_scatter,
         _turns(session, fits, fit.state.normals),
     )
-    quality = judge_corner_fit(fit, used, evidence)
+    quality = judge_corner_fit(fit, used, evidence, limits)
     return WorldCalibration(
         fit.state.T_world_lidar,
         session.cloud_frame,
@@ -156,11 +177,8 @@ def _as_used(covariance: FloatArray, figures: Mapping[str, Any]) -> FloatArray:
 
 
 def _provenance(session: CornerSession, method: str) -> dict[str, Any]:
-    from lidarpose import __version__
-
     frames = sum(len(p.clouds) for p in session.places)
     return {
-        "software": f"lidarpose {__version__}",
         "session": session.name,
         "method": method,
         "places": len(session.places),
@@ -260,6 +278,7 @@ def _cornerwise(
     crops: Sequence[PlaceCrop],
     method: WorldMethod,
     scale_too: bool,
+    limits: PrecisionLimits,
     seed: int,
 ) -> WorldCalibration:
     means: list[_PlaceMean] = []
@@ -290,7 +309,7 @@ def _cornerwise(
         session.cloud_frame,
         {m.position: m.scatter for m in means},
     )
-    quality = judge_corners(pose, w, scale * p, covariance, evidence)
+    quality = judge_corners(pose, w, scale * p, covariance, evidence, limits)
     return WorldCalibration(
         pose, session.cloud_frame, scale, covariance, quality=quality, provenance=_provenance(session, method)
     )
