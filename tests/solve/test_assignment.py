@@ -80,23 +80,23 @@ def test_a_board_that_is_its_own_mirror_image_is_refused_and_the_hint_decides(ri
     with pytest.raises(UndeterminedError, match="--first-panel"):
         assigned(observations)
     first = observations.places[0].scan_lines
-    smaller = 1 if first[0].angle_rad.mean() < first[1].angle_rad.mean() else 2
+    smaller = 0 if first[0].angle_rad.mean() < first[1].angle_rad.mean() else 1
     truth = {p.position: p for p in observations.places}
     right = assigned(observations, first_panel=smaller)
     assert "--first-panel" in right.decided_by
     assert wrong_places(right.places, truth) == []
     # The other hint gives the mirrored solution: that is what nothing tells apart.
-    other = assigned(observations, first_panel=3 - smaller)
+    other = assigned(observations, first_panel=1 - smaller)
     assert len(wrong_places(other.places, truth)) == len(other.places)
 
 
 def test_a_hint_against_the_evidence_is_refused(rig_maker: Callable[..., Any]) -> None:
     observations = rig_maker(4, places=9).observe(0, 0.05, 0.1, 1e-3)
     first = observations.places[0].scan_lines
-    smaller = 1 if first[0].angle_rad.mean() < first[1].angle_rad.mean() else 2
+    smaller = 0 if first[0].angle_rad.mean() < first[1].angle_rad.mean() else 1
     assert len(assigned(observations, first_panel=smaller).places) == 9
     with pytest.raises(InputError, match="--first-panel"):
-        assigned(observations, first_panel=3 - smaller)
+        assigned(observations, first_panel=1 - smaller)
 
 
 def test_places_that_cannot_be_used_are_left_out_with_their_reasons(rig_maker: Callable[..., Any]) -> None:

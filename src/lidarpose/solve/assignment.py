@@ -153,7 +153,7 @@ def assign(
     places
         Stripes by panel, and the scans' straight lines in any order.
     first_panel
-        The user's hint: the panel, 1 or 2, that the line of smaller beam angle lies on.
+        The user's hint: the panel, 0 or 1, that the line of smaller beam angle lies on (1 or 2 on the command line).
 
     Raises
     ------
@@ -452,7 +452,7 @@ def _by_hint(
     if not agreeing:
         raise InputError(
             HINT,
-            f"panel {first_panel} is contradicted by {decided_by}: the line of smaller beam angle lies on the other",
+            f"panel {first_panel + 1} is contradicted by {decided_by}: the line of smaller beam angle lies on the other",
             remedy="Leave the option out, or check that the panels are in the session's order",
         )
     return agreeing[0]
@@ -463,7 +463,7 @@ def _share_with_hint(pool: _Pool, solution: _Solution, places: Sequence[PlaceFea
     for c in solution.chosen[solution.chosen >= 0]:
         candidate = pool.candidates[c]
         first, second = (places[candidate.place].lines[k] for k in candidate.lines)
-        smaller = 1 if np.mean(first.angle_rad) < np.mean(second.angle_rad) else 2
+        smaller = 0 if np.mean(first.angle_rad) < np.mean(second.angle_rad) else 1
         votes.append(smaller == first_panel)
     return float(np.mean(votes)) if votes else 0.0
 
