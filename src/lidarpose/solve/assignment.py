@@ -24,7 +24,7 @@ from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, angle_bet
 from lidarpose.geometry.planes import Plane, fit_plane, intersect_three_planes
 from lidarpose.geometry.se3 import Pose, UncertainPose, log_so3, rotation_z
 from lidarpose.model.camera import Camera
-from lidarpose.model.observation import LeftOut, PlaceFeatures, PlaceObservation, ScanLine
+from lidarpose.model.observation import LeftOut, PlaceFeatures, PlaceObservation, ScanLine, StripePoints
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.solve.light_plane import StripePair, stripe_on_panel, stripe_pair
 from lidarpose.solve.line_pair import FittedLine, fit_line_pair, fit_scan_line, free_directions
@@ -33,6 +33,8 @@ from lidarpose.solve.single_pose import single_pose
 from lidarpose.solve.turntable_function import fit_by_readings, motion_of_pair, require_readings, wide_pairs
 
 LEAST_STRIPE_POINTS = 5
+# Points of a stripe that the choice is made from.
+STRIPE_POINTS = 150
 # How far the lines' angle may differ from the stripes' beyond five sigma.
 ALPHA_SLACK_RAD = np.deg2rad(1.0)
 # A line may reach this far over the fold: noise of E, and a fold that is not sharp.
@@ -216,9 +218,15 @@ def _stripes(
         if key not in place.stripes or len(place.stripes[key]) < LEAST_STRIPE_POINTS:
             raise ValueError(f"no usable stripe on panel {key + 1}")
     T = [poses[key].T_camera_panel for key in (0, 1)]
-    on = [stripe_on_panel(camera, T[key], place.stripes[key]) for key in (0, 1)]
+    on = [stripe_on_panel(camera, T[key], _thinned(place.stripes[key])) for key in (0, 1)]
     pair = stripe_pair((Plane.from_pose(T[0]), Plane.from_pose(T[1])), (on[0], on[1]))
     return pair, (on[0].rays_camera, on[1].rays_camera)
+
+
+def _thinned(stripe: StripePoints) -> StripePoints:
+    """Some of a stripe's points: enough for a choice."""
+    some = np.unique(np.linspace(0, len(stripe) - 1, STRIPE_POINTS).astype(int))
+    return StripePoints(stripe.pixels[some], stripe.normals[some], stripe.sigma_px[some])
 
 
 def _plausible_pairs(fits: list[FittedLine], stripes: StripePair) -> list[tuple[int, int]]:
@@ -452,7 +460,7 @@ def _by_hint(
     if not agreeing:
         raise InputError(
             HINT,
-            f"panel {first_panel + 1} is contradicted by {decided_by}: the line of smaller beam angle lies on the other",
+            f"{decided_by} contradict it: the line of smaller beam angle does not lie on panel {first_panel + 1}",
             remedy="Leave the option out, or check that the panels are in the session's order",
         )
     return agreeing[0]

@@ -97,10 +97,14 @@ def stripe_on_panel(camera: Camera, T_camera_panel: Pose, stripe: StripePoints) 
     plane = Plane.from_pose(T_camera_panel)
     rays = camera.rays(stripe.pixels)
     points = plane.intersect_rays(rays)
-    # Derivative of the ray by the pixel, from one small step across the stripe.
-    h = 0.01
-    moved = plane.intersect_rays(camera.rays(stripe.pixels + h * stripe.normals))
-    spread = (moved - points) / h * stripe.sigma_px[:, None]
+    # How far the point must move on the panel for its pixel to move by one sigma across the stripe.
+    on_panel = T_camera_panel.rotation[:, :2]
+    J = camera.project_with_jacobian(points)[1] @ on_panel
+    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+    n = stripe.normals * (stripe.sigma_px / np.where(det == 0.0, np.nan, det))[:, None]
+    x = J[:, 1, 1] * n[:, 0] - J[:, 0, 1] * n[:, 1]
+    y = J[:, 0, 0] * n[:, 1] - J[:, 1, 0] * n[:, 0]
+    spread = np.column_stack([x, y]) @ on_panel.T
     usable = np.isfinite(points).all(axis=1) & np.isfinite(spread).all(axis=1) & (points[:, 2] > 0.0)
     return StripeOnPanel(points[usable], spread[usable], rays[usable])
 

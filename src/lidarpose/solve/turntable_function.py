@@ -27,7 +27,7 @@ SAME_READING_RAD = 2e-5
 PAIRS = 40
 # A circle on the unit sphere smaller than this shows neither its plane nor its phase.
 SMALL_CIRCLE = 0.05
-# What a pose is known from splits in two: the light plane, and the two lines within it.
+# What a pose is known from splits in two, nearly independent of each other: the light plane, and the two lines in it.
 ACROSS_SCAN_PLANE = [2, 3, 4]
 IN_SCAN_PLANE = [0, 1, 5]
 # Below this (of a stated sigma, or in metres and radians) residuals are rounding.
@@ -81,11 +81,16 @@ def deviations(
     motion: TurntableMotion, turntable_angles_rad: Sequence[float], poses: Sequence[Pose]
 ) -> FunctionDeviations:
     """Deviations of a motion from samples of it (Table 1)."""
-    modelled = [motion.pose(angle) for angle in turntable_angles_rad]
-    centre = [np.linalg.norm(m.translation - p.translation) for m, p in zip(modelled, poses, strict=True)]
-    z = [angle_between(m.rotation[:, 2], p.rotation[:, 2]) for m, p in zip(modelled, poses, strict=True)]
-    x = [angle_between(m.rotation[:, 0], p.rotation[:, 0]) for m, p in zip(modelled, poses, strict=True)]
-    return FunctionDeviations(np.array(centre), np.array(z), np.array(x))
+    readings = np.asarray(turntable_angles_rad, dtype=np.float64)
+    turned = motion.T_camera_turntable.rotation @ rotation_z(readings)
+    centres = turned @ motion.T_turntable_lidar.translation + motion.T_camera_turntable.translation
+    axes = turned @ motion.T_turntable_lidar.rotation
+    R = np.stack([p.rotation for p in poses])
+    return FunctionDeviations(
+        np.linalg.norm(centres - np.stack([p.translation for p in poses]), axis=1),
+        np.asarray(angle_between(axes[:, :, 2], R[:, :, 2])),
+        np.asarray(angle_between(axes[:, :, 0], R[:, :, 0])),
+    )
 
 
 def angles_shown(motion: TurntableMotion, turntable_angles_rad: Sequence[float], poses: Sequence[Pose]) -> FloatArray:
@@ -273,7 +278,7 @@ def _reweigh(
     scale = np.ones(6)
     for block in (ACROSS_SCAN_PLANE, IN_SCAN_PLANE):
         e = residuals[:, block]
-        squares = np.einsum("na,nab,nb->n", e, np.linalg.inv(np.linalg.inv(information)[:, block][:, :, block]), e)
+        squares = np.einsum("na,nab,nb->n", e, information[:, block][:, :, block], e)
         # The median of chi-squared with three degrees of freedom is 2.366.
         scale[block] = max(np.sqrt(float(np.median(squares)) / 2.366), floor)
     scaled = information / np.outer(scale, scale)
