@@ -69,7 +69,9 @@ def calibrate(
 
     found = session_format(session)
     if found == CORNER_SESSION_FORMAT:
-        _calibrate_corners(session, output, method, estimate_scale, want_mm, want_deg, json=json, quiet=quiet)
+        _calibrate_corners(
+            session, output, method, estimate_scale, want_mm, want_deg, report=report, json=json, quiet=quiet
+        )
         return
     if found != SESSION_FORMAT:
         expected = f'"{SESSION_FORMAT}" or "{CORNER_SESSION_FORMAT}"'
@@ -96,6 +98,7 @@ def _calibrate_corners(
     want_mm: float | None,
     want_deg: float | None,
     *,
+    report: bool,
     json: bool,
     quiet: bool,
 ) -> None:
@@ -108,6 +111,7 @@ def _calibrate_corners(
         estimate_scale=estimate_scale or None,
         want_mm=want_mm,
         want_deg=want_deg,
+        report=report,
         json=json,
         quiet=quiet,
     )

@@ -22,10 +22,11 @@ def calibrate_world_session(
     want_mm: float | None = None,
     want_deg: float | None = None,
     seed: int = 0,
+    report: bool = True,
     json: bool = False,
     quiet: bool = False,
 ) -> WorldCalibration:
-    """Calibrate a corner session and write `output`/calibration.json.
+    """Calibrate a corner session and write `output`/calibration.json and `output`/report.html.
 
     Parameters
     ----------
@@ -41,6 +42,8 @@ def calibrate_world_session(
         Standard deviations that are good enough, in place of 5 mm and 0.1 degrees.
     seed
         For the random choices of detection.
+    report
+        Write the report too.
     json
         Print one JSON object in place of the summary.
 
@@ -53,9 +56,11 @@ def calibrate_world_session(
     """
     from lidarpose.cli.console import progress
     from lidarpose.errors import InputError
+    from lidarpose.report.world_page import world_page
+    from lidarpose.storage.atomic import write_text
     from lidarpose.storage.calibration import write_calibration
     from lidarpose.storage.corner_session import read_corner_session, session_provenance, truth_beside
-    from lidarpose.workflows.world import calibrate_world
+    from lidarpose.workflows.world import world_run
 
     methods = {name: name for name in WORLD_METHODS}
     if method not in methods:
@@ -70,7 +75,7 @@ def calibrate_world_session(
     }
     steps = len(session.places) + sum(len(p.clouds) for p in session.places)
     with progress("Reading clouds", steps, quiet=quiet or json) as advance:
-        calibration = calibrate_world(
+        run = world_run(
             session,
             method,  # type: ignore[arg-type]
             estimate_scale=estimate_scale,
@@ -79,8 +84,11 @@ def calibrate_world_session(
             provenance=session_provenance(session_folder, session, options),
             tick=lambda: advance(),
         )
+    calibration = run.calibration
     file = output / "calibration.json"
     write_calibration(file, calibration)
+    if report:
+        write_text(output / "report.html", world_page(run))
     _print_result(calibration, truth_beside(session_folder), file, json)
     return calibration
 

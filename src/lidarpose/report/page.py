@@ -14,6 +14,8 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-
 
 PANEL_CLASSES = ("p1", "p2")
 """Classes of the style sheet for the board's two panels (and for other pairs)."""
+FACE_CLASSES = ("p1", "p2", "lidar")
+"""Classes of the style sheet for three things: a target's faces, or three axes."""
 DESK_WIDE_PX, DESK_HALF_PX, PHONE_PX = 1034.0, 490.0, 336.0
 
 Drawing = Callable[[float], Markup]
@@ -156,11 +158,12 @@ def table(
     `stacked_em`: on a phone the last column goes below the others, and those between it and the first are so wide.
     """
     right = set(numeric)
-    head = el("tr", *(el("th", h, class_="num" if k in right else None) for k, h in enumerate(header)))
+    titles = el("tr", *(el("th", h, class_="num" if k in right else None) for k, h in enumerate(header)))
+    head = el("thead", titles) if any(header) else ""
     body = [el("tr", *(el("td", c, class_="num" if k in right else None) for k, c in enumerate(row))) for row in rows]
     stacked = stacked_em is not None
     style = f"--columns:{len(header) - 2};--cell:{stacked_em:g}em" if stacked else None
-    content = el("table", el("thead", head), el("tbody", *body), class_="stacked" if stacked else None, style=style)
+    content = el("table", head, el("tbody", *body), class_="stacked" if stacked else None, style=style)
     return el("div", content, class_="scroll")
 
 
@@ -171,6 +174,11 @@ def bullets(items: Iterable[object], *, ordered: bool = False) -> Markup:
 def folded(summary: str, *content: object, opened: bool = False) -> Markup:
     """Content behind a line that opens it."""
     return el("details", el("summary", summary), *content, open=opened)
+
+
+def sentence(text: str) -> str:
+    """A reason with a capital letter."""
+    return text[:1].upper() + text[1:]
 
 
 def provenance_block(provenance: Mapping[str, Any]) -> Markup:

@@ -49,11 +49,11 @@ class Scene:
             {"type": "label", "points": _rounded(np.reshape(at, (1, 3))), "text": text, "colour": colour, **style}
         )
 
-    def axes(self, pose: Pose, length: float, **style: object) -> None:
+    def axes(self, pose: Pose, length: float, *, counts: bool = False, **style: object) -> None:
         """The three axes of a frame: x red, y green, z blue, as viewers have them."""
         for k, colour in enumerate(("#e0483e", "#35a853", "#3f7fe0")):
             ends = np.stack([pose.translation, pose.translation + length * pose.rotation[:, k]])
-            self.add("line", ends, colour, width=2, counts=False, **style)
+            self.add("line", ends, colour, width=2, counts=counts, **style)
 
     def data(
         self,

@@ -28,6 +28,7 @@ from lidarpose.report.page import (
     legend_key,
     provenance_block,
     section,
+    sentence,
     table,
     tiles,
     verdict_block,
@@ -87,7 +88,7 @@ def turntable_verdict(run: TurntableRun, numbers: TurnNumbers | None = None) -> 
         "doubtful": "Doubtful: read the reasons first",
         "rejected": "Rejected: do not use this calibration",
     }[tone]
-    reasons = tuple(_sentence(text) for text in (*quality.reasons, *run.notes))
+    reasons = tuple(sentence(text) for text in (*quality.reasons, *run.notes))
     return Verdict(tone, headline, _say(run, found), reasons, todo(run))
 
 
@@ -99,10 +100,6 @@ def wished(run: TurntableRun) -> tuple[float | None, float | None]:
 
 def _number(value: object) -> float | None:
     return float(value) if isinstance(value, (int, float)) and np.isfinite(value) else None
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _say(run: TurntableRun, numbers: TurnNumbers | None) -> str:

@@ -17,6 +17,7 @@ from lidarpose.model.calibration import WorldCalibration
 from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import CornerSession
 from lidarpose.model.observation import LeftOut
+from lidarpose.model.world_run import WorldRun
 from lidarpose.refine.corner_model import (
     CornerFit,
     CornerOptions,
@@ -44,6 +45,7 @@ from lidarpose.workflows.corner_target import (
     gather,
     observe,
 )
+from lidarpose.workflows.world_evidence import corners_run, joint_run
 
 WorldMethod = Literal["joint", "paper", "paper-approx", "ransac", "harris"]
 WORLD_METHODS: tuple[WorldMethod, ...] = ("joint", "paper", "paper-approx", "ransac", "harris")
@@ -65,7 +67,30 @@ def calibrate_world(
     provenance: Mapping[str, Any] | None = None,
     tick: Tick = lambda: None,
 ) -> WorldCalibration:
-    """The pose of the clouds' frame in the world.
+    """The calibration of `world_run`, for those who need no more."""
+    run = world_run(
+        session,
+        method,
+        estimate_scale=estimate_scale,
+        wishes=wishes,
+        seed=seed,
+        provenance=provenance,
+        tick=tick,
+    )
+    return run.calibration
+
+
+def world_run(
+    session: CornerSession,
+    method: WorldMethod = "joint",
+    *,
+    estimate_scale: bool | None = None,
+    wishes: Mapping[str, float] | None = None,
+    seed: int = 0,
+    provenance: Mapping[str, Any] | None = None,
+    tick: Tick = lambda: None,
+) -> WorldRun:
+    """The pose of the clouds' frame in the world, with what a reader needs to see to judge it.
 
     Parameters
     ----------
@@ -102,10 +127,11 @@ def calibrate_world(
     crops = gather(session, found, tick=tick)
     limits = PrecisionLimits(**(wishes or {}))
     if method == "joint":
-        calibration = _joint(session, found, crops, scale_too, limits)
+        run = _joint(session, found, crops, scale_too, limits)
     else:
-        calibration = _cornerwise(session, found, crops, method, scale_too, limits, seed)
-    return replace(calibration, provenance={**(provenance or {}), **calibration.provenance})
+        run = _cornerwise(session, found, crops, method, scale_too, limits, seed)
+    recorded = {**(provenance or {}), **run.calibration.provenance}
+    return replace(run, calibration=replace(run.calibration, provenance=recorded))
 
 
 def _usable_world(session: CornerSession, found: FoundTarget) -> CornerSession:
@@ -120,7 +146,7 @@ def _joint(
     crops: Sequence[PlaceCrop],
     scale_too: bool,
     limits: PrecisionLimits,
-) -> WorldCalibration:
+) -> WorldRun:
     mended = _usable_world(session, found)
     fits = _place_fits(session, found, crops)
     start, sigma_m = _start(mended, fits)
@@ -130,8 +156,8 @@ def _joint(
     fit, used = _fit(mended, places, start, sigma_m, scale_too)
     # Once more with the faces' beams selected by the estimate itself.
     corners = _expected(fit, places, found.world)
-    places, left_out = observe(mended, found, crops, corners, fit.state.normals, fit.range_sigma_m)
-    places, frame_scatter, dropped = _without_odd_frames(places, corners, fit.state.normals, fit.range_sigma_m)
+    observed, left_out = observe(mended, found, crops, corners, fit.state.normals, fit.range_sigma_m)
+    places, frame_scatter, dropped = _without_odd_frames(observed, corners, fit.state.normals, fit.range_sigma_m)
     fit, used = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too)
     left_out += [LeftOut(f"{name}: {n} frames", "their corner is far from the others'") for name, n in dropped.items()]
     evidence = CornerEvidence(
@@ -145,7 +171,7 @@ def _joint(
         _turns(session, fits, fit.state.normals),
     )
     quality = judge_corner_fit(fit, used, evidence, limits)
-    return WorldCalibration(
+    calibration = WorldCalibration(
         fit.state.T_world_lidar,
         session.cloud_frame,
         fit.state.scale,
@@ -155,6 +181,7 @@ def _joint(
         quality,
         _provenance(session, "joint"),
     )
+    return joint_run(session, calibration, fit, used, observed)
 
 
 def _expected(fit: CornerFit, places: Sequence[CornerPlaceFaces], world: FloatArray) -> FloatArray:
@@ -280,7 +307,7 @@ def _cornerwise(
     scale_too: bool,
     limits: PrecisionLimits,
     seed: int,
-) -> WorldCalibration:
+) -> WorldRun:
     means: list[_PlaceMean] = []
     world = []
     left_out = []
@@ -310,9 +337,11 @@ def _cornerwise(
         {m.position: m.scatter for m in means},
     )
     quality = judge_corners(pose, w, scale * p, covariance, evidence, limits)
-    return WorldCalibration(
+    calibration = WorldCalibration(
         pose, session.cloud_frame, scale, covariance, quality=quality, provenance=_provenance(session, method)
     )
+    corners = {m.position: (place, m.corner) for m, place in zip(means, w, strict=True)}
+    return corners_run(session, calibration, method, corners)
 
 
 def _closed_form(method: WorldMethod, world: FloatArray, lidar: FloatArray, scale: float) -> Pose:

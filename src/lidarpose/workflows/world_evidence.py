@@ -1,0 +1,76 @@
+"""What a world calibration shows of itself: each place's faces, its own corner, and the corners of its frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lidarpose.geometry.arrays import FloatArray
+from lidarpose.model.calibration import WorldCalibration
+from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
+from lidarpose.model.corner_session import CornerSession
+from lidarpose.model.world_run import WorldPlace, WorldRun
+from lidarpose.refine.corner_model import CornerFit, frame_corners, place_discrepancies
+
+# More points than this a face say nothing new to the eye.
+MOST_POINTS_A_FACE = 2000
+
+
+def joint_run(
+    session: CornerSession,
+    calibration: WorldCalibration,
+    fit: CornerFit,
+    used: Sequence[CornerPlaceFaces],
+    observed: Sequence[CornerPlaceFaces],
+) -> WorldRun:
+    """The run of the joint estimate.
+
+    Parameters
+    ----------
+    used
+        The places behind `fit`, without the frames that were left out.
+    observed
+        The same places (and perhaps more) with all their frames.
+    """
+    moves, _, known = place_discrepancies(fit)
+    own = fit.state.corners(fit.world) + np.where(known[:, None], moves[:, :3], 0.0)
+    whole = {place.position: place for place in observed}
+    places = []
+    for place, corner in zip(used, own, strict=True):
+        with_all = whole.get(place.position, place)
+        corners = _frame_corners(with_all, fit, corner)
+        kept = np.isin(np.arange(len(corners)), _frames(place.faces))
+        faces = {k: _points(returns) for k, returns in sorted(place.faces.items())}
+        places.append(WorldPlace(place.position, place.corner_world, corner, faces, corners, kept))
+    return WorldRun("joint", session, calibration, tuple(places), fit.state.normals)
+
+
+def corners_run(
+    session: CornerSession,
+    calibration: WorldCalibration,
+    method: str,
+    corners: Mapping[str, tuple[FloatArray, FloatArray]],
+) -> WorldRun:
+    """The run of a method that knows corners alone: by position, the corner in the world and in the clouds' frame."""
+    none = np.zeros((0, 3))
+    places = [
+        WorldPlace(position, world, corner, {}, none, np.zeros(0, dtype=bool))
+        for position, (world, corner) in corners.items()
+    ]
+    return WorldRun(method, session, calibration, tuple(places))
+
+
+def _frame_corners(place: CornerPlaceFaces, fit: CornerFit, corner: FloatArray) -> FloatArray:
+    if len(place.faces) < 3 or place.frames < 2:
+        return np.zeros((0, 3))
+    return frame_corners(place.faces, fit.state.normals, corner, place.frames, fit.range_sigma_m)
+
+
+def _frames(faces: Mapping[int, FaceReturns]) -> FloatArray:
+    return np.unique(np.concatenate([returns.frame for returns in faces.values()]))
+
+
+def _points(returns: FaceReturns) -> FloatArray:
+    step = max(1, len(returns) // MOST_POINTS_A_FACE)
+    return np.asarray(returns.directions[::step] * returns.range_m[::step, None])

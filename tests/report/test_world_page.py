@@ -1,0 +1,74 @@
+"""The world report: in a browser, and as text."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarpose.model.world_run import WorldRun
+from lidarpose.report.world_page import world_page
+from lidarpose.simulate.corner_scene import CornerSceneSpec
+from tests_support.browser import Browser
+from tests_support.page_checks import assert_sound, scene_ink, scene_middle
+from tests_support.world_runs import simulated_world_run
+
+
+@pytest.fixture(scope="module")
+def runs() -> dict[str, WorldRun]:
+    return {
+        "good": simulated_world_run(CornerSceneSpec(frames=5)),
+        "bad": simulated_world_run(CornerSceneSpec(frames=2, places=5), moved_place=2, moved_m=0.06),
+        "paper": simulated_world_run(CornerSceneSpec(frames=2), "paper"),
+    }
+
+
+@pytest.fixture(scope="module")
+def pages(runs: dict[str, WorldRun], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("world")
+    for name, run in runs.items():
+        (folder / f"{name}.html").write_text(world_page(run), encoding="utf-8")
+    return {name: folder / f"{name}.html" for name in runs}
+
+
+@pytest.mark.parametrize("size", [(1280, 900), (390, 844)], ids=["desktop", "phone"])
+@pytest.mark.parametrize("name", ["good", "bad", "paper"])
+def test_page_in_a_browser(browser: Browser, pages: dict[str, Path], name: str, size: tuple[int, int]) -> None:
+    page = browser.open(pages[name], width=size[0], height=size[1], dark=name == "bad")
+    assert_sound(page)
+    x, y = scene_middle(page)
+    before = scene_ink(page)
+    assert before[0] > 0.002
+    drag = page.drag if size[0] > 600 else page.swipe
+    drag((x, y), (x + 80.0, y - 30.0))
+    assert scene_ink(page)[1] != before[1]
+    page.close()
+
+
+def test_good_page_tells_its_numbers(runs: dict[str, WorldRun]) -> None:
+    text = world_page(runs["good"])
+    assert "Good: use this calibration" in text
+    assert "What to do" not in text
+    for words in ("6 of 6", "Corners of single frames", "Place p03, face 1", "Alignment with the world", "5 of 5"):
+        assert words in text
+
+
+def test_bad_page_names_the_place_at_fault(runs: dict[str, WorldRun]) -> None:
+    text = world_page(runs["bad"])
+    verdict = text[text.index('id="verdict"') : text.index('class="tiles"')]
+    assert "Rejected" in verdict
+    assert "Look at place p02 first" in verdict
+
+
+def test_kept_run_holds_the_faces_and_their_corner(runs: dict[str, WorldRun]) -> None:
+    """Points lie on the common planes through their place's corner; frames scatter about it."""
+    run = runs["good"]
+    assert run.normals is not None
+    for place in run.places:
+        for face, points in place.faces.items():
+            off = (points - place.corner) @ run.normals[face]
+            assert abs(np.median(off)) < 0.002
+            assert np.std(off) < 0.012
+        assert np.nanmax(np.abs(place.frame_corners - place.corner)) < 0.02
+        assert np.linalg.norm(place.residual_world(run.calibration)) < 0.002
