@@ -1,0 +1,131 @@
+"""``lidarpose inspect``: what a session holds, lacks, and will determine badly, before anything is calibrated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from lidarpose.cli.options import Json, Quiet
+from lidarpose.errors import InputError, UndeterminedError
+
+if TYPE_CHECKING:
+    from lidarpose.model.session import TurntableSession
+    from lidarpose.workflows.turntable_inspection import TurntableInspection
+
+
+def inspect(
+    session: Path,
+    /,
+    *,
+    any_order: Annotated[bool, Parameter(negative=(), show_default=False)] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Say what is there, what is missing, and what will be badly determined.
+
+    Nothing is written. The exit status is 1 if the session does not determine the pose.
+
+    Parameters
+    ----------
+    session
+        The session's folder, turntable or corner.
+    any_order
+        Accept turntable readings that are equal or go back and forth.
+    """
+    from lidarpose.storage.corner_session import CORNER_SESSION_FORMAT
+    from lidarpose.storage.session import SESSION_FORMAT, session_format
+
+    found = session_format(session)
+    if found == CORNER_SESSION_FORMAT:
+        _inspect_corners(session, json=json)
+    elif found == SESSION_FORMAT:
+        _inspect_turntable(session, any_order=any_order, json=json, quiet=quiet)
+    else:
+        expected = f'"{SESSION_FORMAT}" or "{CORNER_SESSION_FORMAT}"'
+        raise InputError(session / "session.toml", f"is {found!r}", field="format", expected=expected)
+
+
+def _inspect_corners(folder: Path, *, json: bool) -> None:
+    from lidarpose.cli.calibrate_world import inspect_world_session
+    from lidarpose.cli.console import out, print_json
+
+    document = inspect_world_session(folder)
+    if json:
+        print_json(document)
+        return
+    console = out()
+    frames = [place["frames"] for place in document["places"]]
+    console.print(f"corner session: {len(frames)} places, {sum(frames)} clouds, frame {document['cloud_frame']}")
+    for warning in document["warnings"]:
+        console.print(f"  - {warning}", markup=False)
+
+
+def _inspect_turntable(folder: Path, *, any_order: bool, json: bool, quiet: bool) -> None:
+    from lidarpose.cli.console import out, print_json, progress
+    from lidarpose.storage.session import read_turntable_session
+    from lidarpose.workflows.turntable_inspection import inspect_turntable
+
+    session = read_turntable_session(folder, any_order=any_order)
+    with progress("images and scans", len(session.places), quiet=quiet or json) as advance:
+        inspection = inspect_turntable(session, step=advance)
+    if json:
+        print_json(_document(session, inspection))
+    else:
+        for line in _lines(session, inspection):
+            out().print(line, markup=False, soft_wrap=True)
+    if inspection.undetermined is not None:
+        raise UndeterminedError(inspection.undetermined.what, remedy=inspection.undetermined.remedy)
+
+
+def _document(session: TurntableSession, inspection: TurntableInspection) -> dict[str, Any]:
+    return {
+        "kind": "turntable",
+        "places": len(session.places),
+        "readings_deg": {"first": inspection.first_deg, "last": inspection.last_deg, "arc": inspection.arc_deg},
+        "placements": {name: len(shots) for name, shots in session.board_images.items()},
+        "panels": [
+            {"columns": p.columns, "rows": p.rows, "square_m": p.square_m, "corner_sigma_px": sigma}
+            for p, sigma in zip(session.panels, inspection.corner_sigma_px or [None] * len(session.panels), strict=True)
+        ],
+        "places_with_stripes": inspection.places_with_stripes,
+        "places_with_lines": inspection.places_with_lines,
+        "places_used": inspection.places_used,
+        "determined": inspection.undetermined is None,
+        "expected_sigma": [
+            {"angle_deg": angle, "centre_mm": centre, "rotation_deg": rotation}
+            for angle, centre, rotation in inspection.expected_sigma
+        ],
+        "weak": [
+            {"what": d.name, "angle_deg": d.angle_deg, "mm": d.sigma_mm, "deg": d.sigma_deg, "remedy": d.remedy}
+            for d in inspection.weak
+        ],
+        "problems": list(inspection.problems),
+        "left_out": [{"what": item.what, "reason": item.reason} for item in inspection.left_out],
+    }
+
+
+def _lines(session: TurntableSession, inspection: TurntableInspection) -> list[str]:
+    shots = sum(len(images) for images in session.board_images.values())
+    panels = " and ".join(f"{p.columns} x {p.rows} of {1e3 * p.square_m:g} mm" for p in session.panels)
+    lines = [
+        f"camera: {session.camera.width} x {session.camera.height}, {session.camera.model}",
+        f"board: {panels}; {shots} bright images, {len(session.board_images)} placement(s)",
+        f"places: {len(session.places)}, readings {inspection.first_deg:g} to {inspection.last_deg:g} deg",
+        f"found: stripes on every panel at {inspection.places_with_stripes} places, "
+        f"scan lines at {inspection.places_with_lines}, {inspection.places_used} places usable",
+    ]
+    lines += [
+        f"expected sigma at {angle:8.2f} deg: {centre:7.3f} mm {rotation:8.4f} deg"
+        for angle, centre, rotation in inspection.expected_sigma
+    ]
+    lines += [
+        f"weak: {d.name}: {d.sigma_mm:.3f} mm, {d.sigma_deg:.4f} deg at {d.angle_deg:.0f} deg. {d.remedy}"
+        for d in inspection.weak[:3]
+    ]
+    lines += [f"problem: {problem}" for problem in inspection.problems]
+    lines += [f"left out: {item.what}: {item.reason}" for item in inspection.left_out[:20]]
+    if len(inspection.left_out) > 20:
+        lines.append(f"left out: {len(inspection.left_out) - 20} more; --json lists all")
+    return lines
