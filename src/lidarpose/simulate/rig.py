@@ -52,8 +52,8 @@ PAPER_ARC_DEG = 21.5
 PAPER_MARGIN_M = 0.015
 LMS4000_STEP_RAD = float(np.deg2rad(1.0 / 12.0))
 
-# A stripe is of use if it crosses this much of a panel.
-_LEAST_CHORD_M = 0.12
+# A stripe is of use if it crosses this share of a panel's shorter side within the squares.
+_LEAST_CHORD_SHARE = 0.5
 _LEAST_SHARE_OF_GOOD_PLACES = 0.97
 _LARGEST_INCIDENCE_RAD = float(np.deg2rad(66.0))
 _ATTEMPTS = 600
@@ -556,10 +556,12 @@ def _stripes_cross_both_panels(rig: TurntableRig) -> bool:
 
 
 def _is_useful(rig: TurntableRig, place: int) -> bool:
-    for panel in range(len(rig.panels)):
-        ends = rig.chord(place, panel)
-        if ends is None or np.linalg.norm(ends[1] - ends[0]) < _LEAST_CHORD_M:
+    for k, panel in enumerate(rig.panels):
+        T_panel_lidar = rig.T_panel_lidar(place, k)
+        ends = chord_on_plate(T_panel_lidar, Plate.of(panel, 0.0))
+        least = _LEAST_CHORD_SHARE * panel.square_m * (min(panel.columns, panel.rows) + 1)
+        if ends is None or np.linalg.norm(ends[1] - ends[0]) < least:
             return False
-        if not beam_on_panel(rig.T_panel_lidar(place, panel), ends, rig.beam_angle_rad):
+        if not beam_on_panel(T_panel_lidar, ends, rig.beam_angle_rad):
             return False
     return True
