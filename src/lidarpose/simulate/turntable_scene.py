@@ -136,11 +136,12 @@ def draw_scene(rig: TurntableRig, placement: str, seed: int) -> Scene:
     rng = np.random.default_rng([seed, 2])
     plates = tuple(_plate(rig, placement, k) for k in range(len(rig.panels)))
     middle = np.mean([p.T_camera_surface.translation for p in plates], axis=0)
-    pieces = [*_room(rng, middle), *_stand(rng, plates, middle)]
-    for _ in range(int(rng.integers(5, 10))):
-        pieces += _box(rng, middle)
+    things = [[piece] for piece in [*_room(rng, middle), *_stand(rng, plates, middle)]]
+    things += [_box(rng, middle) for _ in range(int(rng.integers(5, 10)))]
     guard = _SightLines(rig, plates)
-    return Scene((*plates, *(p for p in pieces if not guard.blocked_by(p))))
+    # A box goes as a whole: a face of it that is seen edge-on could slip between the lines of sight that are tried.
+    free = [thing for thing in things if not any(guard.blocked_by(piece) for piece in thing)]
+    return Scene((*plates, *(piece for thing in free for piece in thing)))
 
 
 def _plate(rig: TurntableRig, placement: str, index: int) -> Surface:
@@ -249,7 +250,7 @@ class _SightLines:
     """The straight ways from camera and LiDAR to the plates that must stay free."""
 
     def __init__(self, rig: TurntableRig, plates: tuple[Surface, ...]) -> None:
-        grid = np.linspace(-0.999, 0.999, 24)
+        grid = np.linspace(-0.999, 0.999, 40)
         x, y = (g.ravel() for g in np.meshgrid(grid, grid))
         flat = [np.column_stack([p.half_width * x, p.half_height * y, 0 * x]) for p in plates]
         self._targets = np.concatenate([p.T_camera_surface @ f for p, f in zip(plates, flat, strict=True)])
