@@ -55,6 +55,15 @@ def test_the_same_input_gives_the_same_output(simulated_session: Path, tmp_path:
     assert first == second
 
 
+def test_the_hint_on_the_first_panel_is_taken_or_contradicted(
+    simulated_session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    base = ["calibrate", str(simulated_session), "-o", str(tmp_path), "--method", "paper", "--no-report", "--quiet"]
+    statuses = [run([*base, "--first-panel", panel]) for panel in ("1", "2")]
+    assert sorted(statuses) == [0, 2]
+    assert "--first-panel" in capsys.readouterr().err
+
+
 def keep_rows(session: Path, count: int) -> None:
     edit_text(session / "positions.csv", lambda text: "\n".join(text.splitlines()[: count + 1]) + "\n")
 

@@ -132,12 +132,13 @@ def _calibrate_turntable(folder: Path, options: dict[str, Any], *, quiet: bool) 
     from lidarpose.workflows.turntable import calibrate_turntable
 
     session = read_turntable_session(folder, any_order=options["any_order"])
+    first_panel = options["first_panel"]
     wishes = {k: options[k] for k in ("want_mm", "want_deg") if options[k] is not None}
     with progress("images and scans", len(session.places), quiet=quiet) as advance:
         return calibrate_turntable(
             session,
             method=options["method"],
-            first_panel=options["first_panel"],
+            first_panel=None if first_panel is None else first_panel - 1,
             options=JointOptions(estimate=tuple(_parameter_name(extra) for extra in options["estimate"]), **wishes),
             provenance=provenance("calibrate", folder, session_files(folder, session), options),
             step=advance,

@@ -70,7 +70,7 @@ def calibrate_turntable(
     method
         `joint`: one maximum-likelihood estimate over all places. `paper`: the closed forms of the turntable paper.
     first_panel
-        The user's hint: the panel (1 or 2, in the session's order) on which the scan line of smaller beam angle lies.
+        The user's hint: the panel (index 0 or 1) on which the scan line of smaller beam angle lies.
     options
         Of the joint estimate.
     step
