@@ -17,6 +17,7 @@ EXIT_INTERRUPTED = 130
 
 # Commands are named as text, so that `lidarpose --help` imports none of them.
 _COMMANDS: dict[str, tuple[str, str]] = {
+    "demo": ("lidarpose.cli.demo:demo", "Simulate, calibrate, scan and measure, in about a minute."),
     "inspect": ("lidarpose.cli.inspect:inspect", "What a session holds, lacks, and will determine badly."),
     "calibrate": ("lidarpose.cli.calibrate:calibrate", "Find the LiDAR's pose from a session."),
     "scan": ("lidarpose.cli.scan:scan", "Turn a sweep recording into a 3D cloud."),
