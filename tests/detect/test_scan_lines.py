@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import re
+import struct
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lidarpose.detect.scan_lines import find_lines, merge_sweeps, range_noise
 from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.geometry.lines import fit_line2
 from lidarpose.model.scan import LidarSpec, Scan
 
+DATA = Path(__file__).parents[3] / "shared" / "data"
 POLE = 100
 MIXED = -2
 
@@ -144,3 +150,58 @@ def test_exact_and_empty_scans() -> None:
     assert find_lines(Scan(angles, np.full(len(angles), np.nan))) == ()
     assert find_lines(Scan(angles[:0], angles[:0])) == ()
     assert find_lines(Scan(angles[:4], np.ones(4))) == ()
+
+
+def test_black_squares_that_seem_farther_do_not_break_a_panel() -> None:
+    angles = np.deg2rad(np.arange(-30, 30, 1 / 12))
+    rng = np.random.default_rng(5)
+    fold = np.array([1.2, 0.0])
+    ranges = np.full(len(angles), np.nan)
+    for direction in (2.2, -2.1):
+        along = np.array([np.cos(direction), np.sin(direction)])
+        normal = np.array([-along[1], along[0]])
+        r = (fold @ normal) / (np.column_stack([np.cos(angles), np.sin(angles)]) @ normal)
+        place = (r[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]) - fold) @ along
+        on = (place > 0) & (place < 0.3)
+        ranges[on] = r[on] + 0.004 * (np.floor(place[on] / 0.02) % 2)
+    lines = find_lines(Scan(angles, ranges + 0.001 * rng.standard_normal(len(angles))))
+    assert len(lines) == 2
+    assert sum(map(len, lines)) > 0.9 * np.isfinite(ranges).sum()
+    for line, direction in zip(lines, (-2.1, 2.2), strict=True):
+        ends = line.points_lidar()[[0, -1]]
+        found = np.arctan2(*(ends[1] - ends[0])[::-1])
+        assert abs(np.sin(found - direction)) < 0.02
+        assert line.sigma_m[0] > 0.0015  # the squares' steps count as scatter
+
+
+@pytest.mark.skipif(not (DATA / "sick_cola_b").is_dir(), reason=f"the recordings are not at {DATA}")
+def test_two_real_walls_stand_at_right_angles() -> None:
+    """SICK LMS511 telegrams: a wall on either side of the corner at 22 degrees."""
+    scans = lms511_scans()
+    assert len(scans) > 100
+    corners = []
+    for scan in scans[::5]:
+        lines = [line for line in find_lines(scan) if np.ptp(line.points_lidar(), axis=0).max() > 0.5]
+        walls = [fit_line2(line.points_lidar()) for line in lines if line.angle_rad[0] < np.deg2rad(30)]
+        assert len(walls) == 2
+        corners.append(np.rad2deg(np.arccos(abs(walls[0].normal @ walls[1].normal))))
+        assert 0.002 < lines[0].sigma_m[0] < 0.008
+    assert np.mean(corners) == pytest.approx(90.0, abs=0.5)
+    together = Scan(np.concatenate([s.angle_rad for s in scans[:20]]), np.concatenate([s.range_m for s in scans[:20]]))
+    long = [line for line in find_lines(together) if np.ptp(line.points_lidar(), axis=0).max() > 0.4]
+    assert [len(line) for line in long[:2]] == pytest.approx([130, 145], abs=40)
+
+
+def lms511_scans() -> list[Scan]:
+    """The distances in the telegrams (CoLa B): scale, offset, first angle, step, count, values."""
+    entries = json.loads((DATA / "sick_cola_b" / "20210301_lms511.pcapng.json").read_text())
+    payloads = [e["_source"]["layers"].get("tcp", {}).get("tcp.payload", "") for e in entries]
+    stream = b"".join(bytes.fromhex(p.replace(":", "")) for p in payloads)
+    scans = []
+    for match in re.finditer(b"DIST1", stream):
+        scale, _, first, _, count = struct.unpack(">ffiHH", stream[match.end() : match.end() + 16])
+        values = np.frombuffer(stream[match.end() + 16 : match.end() + 16 + 2 * count], ">u2")
+        if len(values) == count:
+            ranges = np.where(values > 0, values * scale / 1e3, np.nan)
+            scans.append(Scan(np.deg2rad(first / 1e4 + np.arange(count) / 6.0), ranges))
+    return scans

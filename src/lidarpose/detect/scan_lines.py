@@ -9,6 +9,7 @@ straight follows from it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -16,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.circles import fit_circle2
 from lidarpose.geometry.lines import Line2
-from lidarpose.geometry.robust import tukey_weights
+from lidarpose.geometry.robust import mad_sigma, tukey_weights
 from lidarpose.model.observation import ScanLine
 from lidarpose.model.scan import LidarSpec, Scan
 
@@ -30,6 +31,17 @@ SPLIT_GAIN = 25.0
 LEAST_DEVIATION = 0.4
 # A line whose direction is known no better than this tells nothing.
 LARGEST_DIRECTION_SIGMA_RAD = np.deg2rad(3.0)
+# Real ranges are rougher than their noise: black squares seem nearer or farther than white ones, and averaging many
+# sweeps leaves what they have in common. Where that shows (less than this share of the beams is explained, or lines are
+# in fragments), lines are looked for at these many times the noise, and averages count as the mean of no more than this
+# many sweeps.
+EXPLAINED = 0.9
+ROUGHNESS = (3.0, 6.0)
+# The second, wider look is for instruments whose squares' steps are many times their noise, not for noisy ones.
+LARGEST_STEP_M = 0.012
+MOST_SWEEPS = 9
+# What scatters by more than this many times the noise is no line at all.
+LARGEST_SCATTER = 6.0
 # Ranges finer than this are rounding, not noise.
 LEAST_SIGMA_M = 1e-7
 
@@ -75,12 +87,52 @@ def find_lines(scan: Scan, spec: LidarSpec | None = None) -> tuple[ScanLine, ...
         return ()
     noise = range_noise(beams)
     stated = spec.range_sigma_m if spec is not None else None
-    pieces = _straight_runs(beams, noise)
-    curved: list[tuple[int, int]] = []
-    segments = [segment for piece in pieces for segment in _split(beams, noise, *piece, curved)]
-    segments = _merged(beams, noise, _away_from_curves(segments, curved))
+    segments, curved = _segments(beams, noise)
+    for roughness in ROUGHNESS:
+        too_wide = roughness > ROUGHNESS[0] and roughness * noise > LARGEST_STEP_M
+        if too_wide or not _fragmented(segments, curved, len(beams)):
+            break
+        coarse, _ = _segments(beams, roughness * noise)
+        segments = _preferred(segments, coarse, curved)
     found = [_finished(beams, noise, stated, segment) for segment in _without_curves(beams, noise, segments)]
     return tuple(line for line in found if line is not None)
+
+
+def _segments(beams: Beams, noise: float) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Straight stretches [first, last) of beams, and curved ones, at a given noise."""
+    curved: list[tuple[int, int]] = []
+    pieces = _straight_runs(beams, noise)
+    segments = [segment for piece in pieces for segment in _split(beams, noise, *piece, curved)]
+    return _merged(beams, noise, _away_from_curves(segments, curved)), curved
+
+
+def _fragmented(segments: list[tuple[int, int]], curved: list[tuple[int, int]], beams: int) -> bool:
+    """Whether much of the scan lies in no line, or three lines follow each other without a step between them."""
+    if sum(last - first for first, last in (*segments, *curved)) < EXPLAINED * beams:
+        return True
+    touching = [b[0] - a[1] <= WINDOW for a, b in pairwise(segments)]
+    return any(a and b for a, b in pairwise(touching))
+
+
+def _preferred(
+    fine: list[tuple[int, int]], coarse: list[tuple[int, int]], curved: list[tuple[int, int]]
+) -> list[tuple[int, int]]:
+    """Coarse stretches in place of the fragments that fine ones are in where ranges are rough but the thing is flat.
+
+    Two fine ones that fill most of a coarse one are a shallow fold, and stay.
+    """
+    kept: list[tuple[int, int]] = []
+    replaced: set[tuple[int, int]] = set()
+    for first, last in coarse:
+        length = last - first
+        inside = [s for s in fine if min(s[1], last) - max(s[0], first) > 0.5 * (s[1] - s[0])]
+        covered = sum(sorted(s[1] - s[0] for s in inside)[-2:])
+        bent = sum(max(0, min(c[1], last) - max(c[0], first)) for c in curved)
+        if covered >= 0.85 * length or bent > 0.3 * length or length <= 2 * WINDOW:
+            continue
+        kept.append((first, last))
+        replaced.update(inside)
+    return sorted([*kept, *(s for s in fine if s not in replaced)])
 
 
 def merge_sweeps(scan: Scan) -> Beams:
@@ -169,7 +221,7 @@ def _straight_runs(beams: Beams, noise: float) -> list[tuple[int, int]]:
     n = len(beams)
     if n < WINDOW:
         return []
-    weight = beams.range_m**2 * np.sqrt(beams.count) / noise
+    weight = beams.range_m**2 * np.sqrt(np.minimum(beams.count, MOST_SWEEPS)) / noise
     angle = sliding_window_view(beams.angle_rad, WINDOW)
     middle = angle[:, WINDOW // 2, None]
     w = sliding_window_view(weight, WINDOW)
@@ -207,7 +259,7 @@ class _Fit:
 
 def _columns(beams: Beams, noise: float, first: int, last: int) -> tuple[FloatArray, FloatArray]:
     r = beams.range_m[first:last]
-    weight = r**2 * np.sqrt(beams.count[first:last]) / noise
+    weight = r**2 * np.sqrt(np.minimum(beams.count[first:last], MOST_SWEEPS)) / noise
     t = beams.angle_rad[first:last]
     return np.stack([np.cos(t) * weight, np.sin(t) * weight]), weight / r
 
@@ -286,7 +338,7 @@ def _is_curved(beams: Beams, noise: float, first: int, last: int, chi2_two_lines
     rays = points / beams.range_m[first:last, None]
     # The distance along the beam is what the noise is stated for.
     along = circle.distance(points) / np.maximum(np.abs((outward * rays).sum(axis=1)), 0.2)
-    chi2 = float(np.sum((along / noise) ** 2 * beams.count[first:last]))
+    chi2 = float(np.sum((along / noise) ** 2 * np.minimum(beams.count[first:last], MOST_SWEEPS)))
     return chi2 < chi2_two_lines
 
 
@@ -339,8 +391,11 @@ def _without_curves(beams: Beams, noise: float, segments: list[tuple[int, int]])
         bend = float(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b))
         bends.append(bend if touching and abs(bend) < np.deg2rad(40.0) else 0.0)
     curved: BoolArray = np.zeros(len(kept), dtype=bool)
+    lengths = [float(np.linalg.norm(e[1] - e[0])) for e in ends]
     for k in range(len(bends) - 1):
-        if bends[k] * bends[k + 1] > 0.0:
+        # Chords of one curve are about equally long; a wall beside bits and pieces is not.
+        alike = max(lengths[k : k + 3]) < 3.0 * min(lengths[k : k + 3])
+        if bends[k] * bends[k + 1] > 0.0 and alike:
             curved[k : k + 3] = True
     return [s for s, drop in zip(kept, curved, strict=True) if not drop]
 
@@ -349,13 +404,15 @@ def _finished(beams: Beams, noise: float, stated: float | None, segment: tuple[i
     """Final robust fit: reach out to the ends, trim them, drop stray ranges, state the scatter."""
     first, last = segment
     weights: FloatArray = np.ones(last - first)
-    fit = _fit(beams, noise, first, last)
+    fit, scale = _fit(beams, noise, first, last), 1.0
     for _ in range(5):
-        weights = tukey_weights(fit.residuals / 1.5)
+        # Rough ranges scatter by more than the noise, but never without bound.
+        scale = min(max(1.0, mad_sigma(fit.residuals, centred=True)), LARGEST_SCATTER)
+        weights = tukey_weights(fit.residuals / (1.5 * scale))
         if np.count_nonzero(weights) < LEAST_BEAMS:
             return None
         fit = _fit(beams, noise, first, last, weights)
-    good = np.abs(fit.residuals) < 3.5
+    good = np.abs(fit.residuals) < 3.5 * scale
     first, good = _trimmed(first, good)
     if np.count_nonzero(good) < LEAST_BEAMS:
         return None
@@ -367,6 +424,8 @@ def _finished(beams: Beams, noise: float, stated: float | None, segment: tuple[i
     residuals = across / np.maximum(incidence, 0.05) * np.sqrt(beams.count[index])
     # Ten beams' worth of what the whole scan says, against the line's own scatter.
     scatter = np.sqrt((10.0 * noise**2 + residuals @ residuals) / (8.0 + len(index)))
+    if scatter > LARGEST_SCATTER * noise:
+        return None
     sigma = max(scatter, stated) if stated is not None else scatter
     along = np.column_stack([r * np.cos(t), r * np.sin(t)]) @ line.direction
     reach = float(np.sqrt(np.sum((along - along.mean()) ** 2)))
