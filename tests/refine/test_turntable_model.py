@@ -64,7 +64,7 @@ def test_line_jacobians_equal_numerical_ones(kind: str) -> None:
 def test_range_jacobian_holds_away_from_zero_extras() -> None:
     data, state = exact(draw_rig(5, places=3))
     step = np.zeros(N_GLOBAL + 12)
-    step[10:N_GLOBAL] = [1e-3, 2e-3, 1e-3, 5e-4, 1e-3, 0.0]
+    step[10:N_GLOBAL] = [1e-3, 2e-3, 1e-3, 5e-4, 1e-3, 0.0, 0.0, 0.0]
     state = state.moved(step, data.centres)
     here = linearise(data, state).lines["ranges"]
     lines = data.ranges.lines
@@ -80,7 +80,8 @@ def test_range_jacobian_holds_away_from_zero_extras() -> None:
 def test_corner_jacobians_equal_numerical_ones() -> None:
     data, state = exact(draw_rig(5, family="mixed", places=3))
     for k, corner in enumerate(linearise(data, state).corners):
-        columns = [*range(N_GLOBAL + 6 * k, N_GLOBAL + 6 * k + 6), 10 + EXTRAS.index("focal_scale")]
+        camera = [10 + EXTRAS.index(name) for name in ("focal_scale", "centre_x_px", "centre_y_px")]
+        columns = [*range(N_GLOBAL + 6 * k, N_GLOBAL + 6 * k + 6), *camera]
         for i, p in enumerate(columns):
             step = np.zeros(N_GLOBAL + 6 * len(data.slots))
             step[p] = 1e-6

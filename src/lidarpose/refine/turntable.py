@@ -81,6 +81,8 @@ _LARGEST_SIGMA: dict[str, float] = {
     "beam_angle_scale": 0.02,
     "black_bias_m": 0.02,
     "focal_scale": 0.05,
+    "centre_x_px": 30.0,
+    "centre_y_px": 30.0,
 }
 """An extra parameter that the data determine no better than this is not turned on."""
 

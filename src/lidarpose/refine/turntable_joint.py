@@ -32,6 +32,7 @@ from lidarpose.refine.least_squares import (
 from lidarpose.refine.noise import information_correction, robust_scale, taper_weights
 from lidarpose.refine.place_effects import place_variance
 from lidarpose.refine.turntable_model import (
+    CAMERA_EXTRAS,
     EXTRAS,
     N_GLOBAL,
     N_MOTION,
@@ -50,8 +51,6 @@ Moments = dict[Kind, FloatArray]
 """By kind: `line_moments` (S, b + 3, b + 3)."""
 
 Start = tuple[TurntableMotion, Mapping[str, tuple[Pose | None, ...]]]
-
-_FOCAL = EXTRAS.index("focal_scale")
 
 
 @dataclass(frozen=True)
@@ -301,7 +300,7 @@ def normal_equations(data: JointData, at: Linearised, noise: Noise, moments: Mom
     information, gradient, total = np.zeros((n, n)), np.zeros(n), 0.0
     for k, corner in enumerate(at.corners):
         weight = _corner_weight(data, noise.corners, k)
-        columns = [*range(N_GLOBAL + 6 * k, N_GLOBAL + 6 * k + 6), N_MOTION + _FOCAL]
+        columns = [*range(N_GLOBAL + 6 * k, N_GLOBAL + 6 * k + 6), *CAMERA_EXTRAS]
         information[np.ix_(columns, columns)] += corner.jacobian.T @ (weight[:, None] * corner.jacobian)
         gradient[columns] -= corner.jacobian.T @ (weight * corner.residual)
         total += float(weight @ corner.residual**2)

@@ -30,15 +30,18 @@ EXTRAS = (
     "beam_angle_scale",
     "black_bias_m",
     "focal_scale",
+    "centre_x_px",
+    "centre_y_px",
 )
 """Further parameters, each zero where it is not estimated (scales are the excess over 1):
 true angle = (1 + encoder_scale) * reading; measured range = (1 + range_scale) * distance + range_offset_m, and
 black_bias_m more on black; true beam angle = (1 + beam_angle_scale) * stated one; true focal length =
-(1 + focal_scale) * stated one."""
+(1 + focal_scale) * stated one, true principal point = stated one + (centre_x_px, centre_y_px)."""
 
 N_MOTION = 10
 N_GLOBAL = N_MOTION + len(EXTRAS)
-_ENCODER, _OFFSET, _RANGE_SCALE, _BEAM, _BLACK, _FOCAL = range(N_MOTION, N_GLOBAL)
+_ENCODER, _OFFSET, _RANGE_SCALE, _BEAM, _BLACK, _FOCAL, _CENTRE_X, _CENTRE_Y = range(N_MOTION, N_GLOBAL)
+CAMERA_EXTRAS = [_FOCAL, _CENTRE_X, _CENTRE_Y]
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class StripeRows:
-    """Stripe pixels as rays (z = 1), with their derivatives by a pixel across the stripe and by the focal scale."""
+    """Stripe pixels as rays (z = 1), with their derivatives by a pixel across the stripe and by the camera's extras."""
 
     lines: Lines
     pixels: FloatArray
@@ -88,11 +91,16 @@ class StripeRows:
     rays: FloatArray
     ray_per_px: FloatArray
     ray_per_focal: FloatArray
+    ray_per_x: FloatArray
+    ray_per_y: FloatArray
 
     @property
     def ray_size_px(self) -> FloatArray:
         """Length (N,) of the ray's derivative by a pixel."""
         return np.asarray(np.linalg.norm(self.ray_per_px, axis=1))
+
+
+RAY_DERIVATIVES = ("ray_per_px", "ray_per_focal", "ray_per_x", "ray_per_y")
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +281,7 @@ def thinned(data: JointData, rows_a_line: int) -> JointData:
         data,
         stripes=StripeRows(
             s_lines,
-            *(getattr(stripes, n)[s_keep] for n in ("pixels", "normals", "rays", "ray_per_px", "ray_per_focal")),
+            *(getattr(stripes, name)[s_keep] for name in ("pixels", "normals", "rays", *RAY_DERIVATIVES)),
         ),
         ranges=RangeRows(r_lines, *(getattr(ranges, n)[r_keep] for n in ("angle_rad", "range_m", "darkness"))),
     )
@@ -345,7 +353,8 @@ def stripe_rays(camera: Camera, lines: Lines, pixels: FloatArray, normals: Float
     flat = np.zeros((len(rays), 1))
     if lost.any():
         lines = replace(lines, sigma=np.where(lost, np.inf, lines.sigma))
-    return StripeRows(lines, pixels, normals, rays, np.hstack([per_px, flat]), np.hstack([per_focal, flat]))
+    derivatives = [per_px, per_focal, -inverse[:, :, 0], -inverse[:, :, 1]]
+    return StripeRows(lines, pixels, normals, rays, *(np.hstack([d, flat]) for d in derivatives))
 
 
 def _range_rows(items: list[tuple[int, int, ScanLine]], has_intensity: bool) -> RangeRows:
@@ -404,7 +413,7 @@ class LineResiduals:
 
 @dataclass(frozen=True, eq=False)
 class CornerResiduals:
-    """Of one panel: residuals (2N,) and derivatives (2N, 7) by the panel's six numbers and the focal scale."""
+    """Of one panel: residuals (2N,) and derivatives (2N, 9) by the panel's six numbers and the camera's extras."""
 
     residual: FloatArray
     jacobian: FloatArray
@@ -413,7 +422,7 @@ class CornerResiduals:
 def corner_residuals(data: JointData, state: JointState, k: int) -> CornerResiduals:
     """Measured less predicted pixels of panel k, x and y in turn."""
     corners, pose = data.corners[k], state.panels[k]
-    camera = focal_scaled(data.camera, float(state.extras[_FOCAL - N_MOTION]))
+    camera = corrected_camera(data.camera, state.extras)
     points = pose @ corners.corners_panel
     predicted, J_point = camera.project_with_jacobian(points)
     local = points - pose @ data.centres[k]
@@ -421,18 +430,22 @@ def corner_residuals(data: JointData, state: JointState, k: int) -> CornerResidu
     J_pose = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -skew(local)], axis=2)
     R2 = np.zeros((6, 6))
     R2[:3, :3] = R2[3:, 3:] = pose.rotation
-    J = np.empty((len(points), 2, 7))
+    J = np.zeros((len(points), 2, 9))
     J[:, :, :6] = -(J_point @ J_pose @ R2)
     J[:, :, 6] = -(predicted - camera.K[:2, 2]) / (1.0 + state.extras[_FOCAL - N_MOTION])
+    J[:, 0, 7] = J[:, 1, 8] = -1.0
     residual = corners.pixels - predicted
-    return CornerResiduals(np.where(np.isfinite(residual), residual, 1e6).ravel(), J.reshape(-1, 7))
+    return CornerResiduals(np.where(np.isfinite(residual), residual, 1e6).ravel(), J.reshape(-1, 9))
 
 
-def focal_scaled(camera: Camera, scale: float) -> Camera:
-    if scale == 0.0:
+def corrected_camera(camera: Camera, extras: FloatArray) -> Camera:
+    """The camera with the camera's extras applied."""
+    focal, x, y = (float(extras[p - N_MOTION]) for p in CAMERA_EXTRAS)
+    if focal == x == y == 0.0:
         return camera
     K = camera.K.copy()
-    K[:2, :2] *= 1.0 + scale
+    K[:2, :2] *= 1.0 + focal
+    K[:2, 2] += x, y
     return replace(camera, K=K)
 
 
@@ -457,7 +470,7 @@ def _moment_map(direction: FloatArray, R: FloatArray, t: FloatArray) -> FloatArr
     return out
 
 
-def _panel_jacobians(state: JointState, data: JointData) -> FloatArray:
+def panel_jacobians(state: JointState, data: JointData) -> FloatArray:
     """(K, 6, 6): left perturbation in the camera frame by the local one at the panel's centre."""
     adjoints = [(p @ Pose(np.eye(3), c)).adjoint() for p, c in zip(state.panels, data.centres, strict=True)]
     return np.array(adjoints).reshape(-1, 6, 6)
@@ -473,54 +486,65 @@ def stripe_residuals(data: JointData, state: JointState) -> LineResiduals:
     of_row = lines.line_of_row
     R_place, t_place, J_place = state.turned(data.angles_rad, data.reference_rad)
     R_panel, t_panel, map_panel = _panel_geometry(data, state)
-    if state.extras[_FOCAL - N_MOTION] != 0.0:
-        camera = focal_scaled(data.camera, float(state.extras[_FOCAL - N_MOTION]))
-        rows = stripe_rays(camera, lines, rows.pixels, rows.normals)
+    if np.any(state.extras[np.array(CAMERA_EXTRAS) - N_MOTION] != 0.0):
+        rows = stripe_rays(corrected_camera(data.camera, state.extras), lines, rows.pixels, rows.normals)
     offset = np.einsum("ki,ki->k", R_panel[:, :, 2], t_panel)[lines.slot][of_row]
     height = np.einsum("mi,mi->m", R_place[:, :, 2], t_place)[lines.place][of_row]
-    ray_n, ray_m, px_n, px_m, focal_n, focal_m, ray_x, ray_y = _stripe_products(
-        rows, R_panel[lines.slot], R_place[lines.place][:, :, 2]
-    )
+    products = _stripe_products(rows, R_panel[lines.slot], R_place[lines.place][:, :, 2])
+    ray_n, ray_m, px_n, px_m, focal_n, focal_m, x_n, x_m, y_n, y_m, ray_x, ray_y, px_x, px_y = products
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = offset / ray_n
-        alpha = ray_m / ray_n
-        distance = ray_m * depth - height
-        per_pixel = depth * (px_m - alpha * px_n)
+        # From the measured pixel to the stripe, then once more from the point found there: the residual is exact to
+        # second order, and the derivatives, taken on the stripe, do not depend on the pixel's own noise.
+        residual = np.zeros_like(ray_n)
+        for _ in range(2):
+            depth = offset / (ray_n - residual * px_n)
+            alpha = (ray_m - residual * px_m) / (ray_n - residual * px_n)
+            per_pixel = depth * (px_m - alpha * px_n)
+            step = ((ray_m - residual * px_m) * depth - height) / per_pixel
+            if not residual.any():
+                residual = np.clip(np.nan_to_num(step), -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
+        residual = residual + step
         inverse = 1.0 / per_pixel
-    valid = np.isfinite(inverse) & np.isfinite(distance) & (depth > 0.0) & np.isfinite(lines.sigma)
+    valid = np.isfinite(inverse) & np.isfinite(residual) & (depth > 0.0) & np.isfinite(lines.sigma)
     # Where the measured normal runs along the predicted stripe, a pixel across it says nothing.
     valid &= np.abs(per_pixel) > 0.02 * depth * rows.ray_size_px
     centre = np.einsum("kij,ki->kj", R_panel, t_panel)[lines.slot][of_row]
-    basis = np.empty((len(valid), 7))
+    basis = np.empty((len(valid), 9))
     basis[:, 0] = np.where(valid, inverse, 0.0)
     depth = np.where(valid, depth, 0.0)
     alpha = np.where(valid, alpha, 0.0)
-    basis[:, 1] = basis[:, 0] * (depth * ray_x - centre[:, 0])
-    basis[:, 2] = basis[:, 0] * (depth * ray_y - centre[:, 1])
+    on_stripe = np.where(valid, residual, 0.0)
+    basis[:, 1] = basis[:, 0] * (depth * (ray_x - on_stripe * px_x) - centre[:, 0])
+    basis[:, 2] = basis[:, 0] * (depth * (ray_y - on_stripe * px_y) - centre[:, 1])
     basis[:, 3:6] = alpha[:, None] * basis[:, :3]
-    basis[:, 6] = basis[:, 0] * depth * (focal_m - alpha * focal_n)
-    to = np.zeros((lines.count, 7, N_GLOBAL + 6))
+    for column, (by_m, by_n) in enumerate(((focal_m, focal_n), (x_m, x_n), (y_m, y_n)), start=6):
+        basis[:, column] = basis[:, 0] * depth * (by_m - alpha * by_n)
+    to = np.zeros((lines.count, 9, N_GLOBAL + 6))
     light = _moment_map(R_place[lines.place, :, 2], R_panel[lines.slot], t_panel[lines.slot])
     to[:, :3, : N_MOTION + 1] = -np.swapaxes(light, 1, 2) @ J_place[lines.place]
-    J_panel = _panel_jacobians(state, data)
+    J_panel = panel_jacobians(state, data)
     to[:, 3:6, N_GLOBAL:] = np.swapaxes(map_panel[lines.slot], 1, 2) @ J_panel[lines.slot]
-    to[:, 6, _FOCAL] = 1.0
-    return LineResiduals(np.where(valid, distance * inverse, 0.0), basis, to, valid)
+    for column, p in enumerate(CAMERA_EXTRAS, start=6):
+        to[:, column, p] = 1.0
+    return LineResiduals(np.where(valid, residual, 0.0), basis, to, valid)
+
+
+_LARGEST_STEP_PX = 100.0
 
 
 def _stripe_products(rows: StripeRows, R_panel: FloatArray, light_normal: FloatArray) -> FloatArray:
-    """Products (8, N) of each row's ray and its two derivatives with its line's vectors.
+    """Products (14, N) of each row's ray and its derivatives with its line's vectors.
 
-    In this order: the ray, its derivative by a pixel and by the focal scale, each with the panel's normal and with the
-    light plane's (S, 3); the ray with the panel's two axes. One small matrix product a line.
+    The ray and its derivatives by a pixel, the focal scale and the principal point, each with the panel's normal and
+    with the light plane's (S, 3); last the ray and its derivative by a pixel with the panel's two axes. One small matrix product a line.
     """
-    joined = np.concatenate([rows.rays, rows.ray_per_px, rows.ray_per_focal], axis=1)
-    factors = np.zeros((rows.lines.count, 9, 8))
-    for k in range(3):
+    joined = np.concatenate([rows.rays, *(getattr(rows, name) for name in RAY_DERIVATIVES)], axis=1)
+    factors = np.zeros((rows.lines.count, 15, 14))
+    for k in range(5):
         factors[:, 3 * k : 3 * k + 3, 2 * k] = R_panel[:, :, 2]
         factors[:, 3 * k : 3 * k + 3, 2 * k + 1] = light_normal
-    factors[:, :3, 6:] = R_panel[:, :, :2]
-    out = np.empty((len(joined), 8))
+    factors[:, :3, 10:12] = factors[:, 3:6, 12:] = R_panel[:, :, :2]
+    out = np.empty((len(joined), 14))
     start = rows.lines.start
     for j in range(rows.lines.count):
         np.matmul(joined[start[j] : start[j + 1]], factors[j], out=out[start[j] : start[j + 1]])
@@ -533,7 +557,7 @@ def range_residuals(data: JointData, state: JointState) -> LineResiduals:
     of_row = lines.line_of_row
     R_place, t_place, J_place = state.turned(data.angles_rad, data.reference_rad)
     R_panel, t_panel, map_panel = _panel_geometry(data, state)
-    offset_m, scale, beam, black = state.extras[1:5]
+    offset_m, scale, beam, black = state.extras[np.array([_OFFSET, _RANGE_SCALE, _BEAM, _BLACK]) - N_MOTION]
     angle = (1.0 + beam) * rows.angle_rad
     c, s = np.cos(angle), np.sin(angle)
     # The panel's normal in the LiDAR frame, one a line: beams then need two products each.
@@ -560,7 +584,7 @@ def range_residuals(data: JointData, state: JointState) -> LineResiduals:
     to = np.zeros((lines.count, 7, N_GLOBAL + 6))
     plane = np.swapaxes(map_panel[lines.slot], 1, 2)
     to[:, :3, : N_MOTION + 1] = plane @ J_place[lines.place]
-    to[:, :3, N_GLOBAL:] = -plane @ _panel_jacobians(state, data)[lines.slot]
+    to[:, :3, N_GLOBAL:] = -plane @ panel_jacobians(state, data)[lines.slot]
     for row, column in zip(range(3, 7), (_OFFSET, _RANGE_SCALE, _BEAM, _BLACK), strict=True):
         to[:, row, column] = 1.0
     residual = rows.range_m - (1.0 + scale) * predicted - offset_m - black * rows.darkness

@@ -29,6 +29,8 @@ EXTRA_WORDS: dict[str, str] = {
     "beam_angle_scale": "the beam angles seem to be off by a factor (rounded angular step)",
     "black_bias_m": "ranges on black squares differ from those on white ones",
     "focal_scale": "the camera's focal length does not fit the board",
+    "centre_x_px": "the camera's principal point does not fit the board (x)",
+    "centre_y_px": "the camera's principal point does not fit the board (y)",
 }
 _TOLERATED: dict[str, float] = {
     "encoder_scale": 2e-3,
@@ -37,6 +39,8 @@ _TOLERATED: dict[str, float] = {
     "beam_angle_scale": 2e-3,
     "black_bias_m": 3e-4,
     "focal_scale": 4e-3,
+    "centre_x_px": 8.0,
+    "centre_y_px": 8.0,
 }
 
 
@@ -152,6 +156,8 @@ def _judge_extras(jury: _Judge, evidence: Evidence) -> None:
 def describe_extra(extra: ExtraParameter) -> str:
     if extra.name.endswith("_m"):
         return f"{1e3 * extra.value:+.2f} mm (standard deviation {1e3 * extra.sigma:.2f} mm)"
+    if extra.name.endswith("_px"):
+        return f"{extra.value:+.1f} px (standard deviation {extra.sigma:.1f} px)"
     return f"{100.0 * extra.value:+.2f} % (standard deviation {100.0 * extra.sigma:.2f} %)"
 
 
