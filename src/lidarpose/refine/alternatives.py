@@ -1,0 +1,235 @@
+"""What if a file meant something else? Sessions whose parts contradict each other are tried under other readings of them.
+
+Units, panels and the order of scans are tried one at a time, from a start of their own, on a part of the places and rows. The
+alternative under which the contradiction is gone is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarpose.errors import UndeterminedError
+from lidarpose.model.observation import PanelCorners, PlaceObservation, ScanLine, StripePoints, TurntableObservations
+from lidarpose.refine.turntable_joint import JointOptions, Solution, Start, lines_of, solve_joint
+from lidarpose.refine.turntable_model import lay_out, start_state
+
+_MOST_PLACES = 31
+_MOST_ROWS = 60
+_CLEARLY_BETTER = 60.0
+_FAR_M = 60.0
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A text that names the fault, and the observations with it mended."""
+
+    text: str
+    observations: TurntableObservations
+
+
+def misfit(solution: Solution) -> float:
+    """Deviance of lines at their estimated noise in units of the stated one: what alternatives are compared by.
+
+    Twice the negative log-likelihood but for constants, with a price for lines that had to be left out.
+    """
+    total = 0.0
+    for kind, noise in solution.noise.lines.items():
+        lines = lines_of(solution.data, kind)
+        rows = float((noise.row_weights > 0.0).sum())
+        per_line = rows / max(lines.count, 1)
+        stated = float(np.median(lines.sigma[np.isfinite(lines.sigma)]))
+        whole = noise.factor**2 / max(per_line, 1.0) + noise.place_variance / stated**2
+        total += (rows - 2.0 * lines.count) * 2.0 * np.log(noise.factor)
+        total += 2.0 * lines.count * np.log(whole)
+        total += 40.0 * float((noise.line_weights == 0.0).sum())
+    corners = solution.noise.corners
+    total += 2.0 * float(sum(len(w) for w in corners.weights)) * np.log(corners.factor)
+    return float(total)
+
+
+def explain_by_alternative(observations: TurntableObservations, options: JointOptions) -> str | None:
+    """The alternative that removes a contradiction, in words; None where none does or no restart was given."""
+    if options.restart is None:
+        return None
+    part = thinned_observations(observations)
+    now = _try(part, options)
+    best: tuple[float, str] | None = None
+    for alternative in alternatives(part):
+        score = _try(alternative.observations, options)
+        if score is not None and (best is None or score < best[0]):
+            best = (score, alternative.text)
+    if best is None or (now is not None and best[0] > now - _CLEARLY_BETTER):
+        return None
+    return best[1]
+
+
+def _try(observations: TurntableObservations, options: JointOptions) -> float | None:
+    """Misfit under one reading of the files; None where it gives no sound solution."""
+    assert options.restart is not None
+    try:
+        motion, panels = options.restart(observations)
+        data = lay_out(observations, use_stripes=options.use_stripes)
+        solution = solve_joint(data, start_state(data, motion, panels), replace(options, estimate=(), max_iterations=30))
+    except (UndeterminedError, ValueError, np.linalg.LinAlgError):
+        return None
+    return misfit(solution)
+
+
+def alternatives(observations: TurntableObservations) -> Iterator[Alternative]:
+    """Everything that is tried."""
+    yield from _units(observations)
+    yield from _readings(observations)
+    yield from _panels(observations)
+    yield from _order(observations)
+
+
+def _units(observations: TurntableObservations) -> Iterator[Alternative]:
+    ranges = np.concatenate([line.range_m for p in observations.places for line in p.scan_lines.values()])
+    sizes = np.concatenate([c.corners_panel.max(axis=0) for cs in observations.corners.values() for c in cs])
+    if np.median(ranges) > _FAR_M:
+        for factor, unit in ((1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches")):
+            yield Alternative(
+                f"the ranges fit if they are in {unit}, not metres", _with_lines(observations, _scaled_ranges(factor))
+            )
+    if sizes.max() > 20.0:
+        for factor, unit in ((1e-3, "millimetres"), (1e-2, "centimetres")):
+            yield Alternative(
+                f"the board fits if its squares are given in {unit}, not metres",
+                _with_corners(observations, _scaled_squares(factor)),
+            )
+    for factor, unit in ((0.0254, "inches"), (0.3048, "feet"), (1e-2, "centimetres"), (1e-1, "decimetres")):
+        if np.median(ranges) <= _FAR_M:
+            yield Alternative(
+                f"the ranges fit if they are in {unit}, not metres", _with_lines(observations, _scaled_ranges(factor))
+            )
+
+
+def _readings(observations: TurntableObservations) -> Iterator[Alternative]:
+    words = {
+        180.0 / np.pi: "the turntable's readings fit if they were radians that were read as degrees",
+        np.pi / 180.0: "the turntable's readings fit if they are degrees that were taken as radians",
+        2.0: "the turntable's readings fit if they are doubled",
+        0.5: "the turntable's readings fit if they are halved",
+        10.0: "the turntable's readings fit if they are multiplied by 10",
+        0.1: "the turntable's readings fit if they are divided by 10",
+    }
+    for factor, text in words.items():
+        yield Alternative(text, _with_readings(observations, factor))
+    yield Alternative(
+        "the turntable's readings and the places are in opposite order",
+        _with_places(observations, [p.turntable_angle_rad for p in observations.places][::-1]),
+    )
+
+
+def _panels(observations: TurntableObservations) -> Iterator[Alternative]:
+    if len(observations.panels) != 2:
+        return
+    yield Alternative(
+        "the scan lines fit if each belongs to the other panel (panels swapped)",
+        _mapped(observations, lambda p: replace(p, scan_lines={1 - k: v for k, v in p.scan_lines.items()})),
+    )
+    yield Alternative(
+        "the stripes fit if each belongs to the other panel (panels swapped)",
+        _mapped(observations, lambda p: replace(p, stripes={1 - k: v for k, v in p.stripes.items()})),
+    )
+    yield Alternative(
+        "stripes and scan lines fit if the two boards are swapped",
+        replace(observations, corners={name: tuple(cs[::-1]) for name, cs in observations.corners.items()}),
+    )
+
+
+def _order(observations: TurntableObservations) -> Iterator[Alternative]:
+    """Scans against everything else: reversed in time, or some places late."""
+    places = observations.places
+    scans = [p.scan_lines for p in places]
+    reverse = [replace(p, scan_lines=s) for p, s in zip(places, scans[::-1], strict=True)]
+    yield Alternative(
+        "the scans are in the opposite order of the stripe images (reversed scans)",
+        replace(observations, places=tuple(reverse)),
+    )
+    first = len(places) // 2
+    for half, which in ((slice(first, None), "second"), (slice(0, first), "first")):
+        flipped = list(places)
+        flipped[half] = [_flipped(p) for p in places[half]]
+        yield Alternative(
+            f"the beams of the scans in the {which} half run the other way round (reversed scans)",
+            replace(observations, places=tuple(flipped)),
+        )
+
+
+def _flipped(place: PlaceObservation) -> PlaceObservation:
+    def flip(line: ScanLine) -> ScanLine:
+        intensity = None if line.intensity is None else line.intensity[::-1]
+        return ScanLine(-line.angle_rad[::-1], line.range_m[::-1], line.sigma_m[::-1], intensity)
+
+    return replace(place, scan_lines={k: flip(line) for k, line in place.scan_lines.items()})
+
+
+# --- edits of observations ------------------------------------------------------------------------------------------
+
+
+def thinned_observations(observations: TurntableObservations) -> TurntableObservations:
+    """At most 31 places and 60 rows a line: enough to see whether parts contradict each other."""
+    index = np.unique(np.linspace(0, len(observations.places) - 1, _MOST_PLACES).round().astype(int))
+    places = tuple(_thin_place(observations.places[int(i)]) for i in index)
+    return replace(observations, places=places)
+
+
+def _thin_place(place: PlaceObservation) -> PlaceObservation:
+    def stripe(s: StripePoints) -> StripePoints:
+        keep = np.unique(np.linspace(0, len(s) - 1, _MOST_ROWS).round().astype(int))
+        return StripePoints(s.pixels[keep], s.normals[keep], s.sigma_px[keep])
+
+    def line(s: ScanLine) -> ScanLine:
+        keep = np.unique(np.linspace(0, len(s) - 1, _MOST_ROWS).round().astype(int))
+        intensity = None if s.intensity is None else s.intensity[keep]
+        return ScanLine(s.angle_rad[keep], s.range_m[keep], s.sigma_m[keep], intensity)
+
+    return replace(
+        place,
+        stripes={k: stripe(s) for k, s in place.stripes.items()},
+        scan_lines={k: line(s) for k, s in place.scan_lines.items()},
+    )
+
+
+def _mapped(
+    observations: TurntableObservations, change: Callable[[PlaceObservation], PlaceObservation]
+) -> TurntableObservations:
+    return replace(observations, places=tuple(change(p) for p in observations.places))
+
+
+def _with_lines(observations: TurntableObservations, change: Callable[[ScanLine], ScanLine]) -> TurntableObservations:
+    return _mapped(
+        observations, lambda p: replace(p, scan_lines={k: change(line) for k, line in p.scan_lines.items()})
+    )
+
+
+def _scaled_ranges(factor: float) -> Callable[[ScanLine], ScanLine]:
+    # The stated noise is scaled too: it is the unit in which misfits are compared.
+    return lambda line: replace(line, range_m=line.range_m * factor, sigma_m=line.sigma_m * factor)
+
+
+def _with_corners(
+    observations: TurntableObservations, change: Callable[[PanelCorners], PanelCorners]
+) -> TurntableObservations:
+    return replace(
+        observations, corners={name: tuple(change(c) for c in cs) for name, cs in observations.corners.items()}
+    )
+
+
+def _scaled_squares(factor: float) -> Callable[[PanelCorners], PanelCorners]:
+    return lambda corners: replace(corners, corners_panel=corners.corners_panel * factor)
+
+
+def _with_readings(observations: TurntableObservations, factor: float) -> TurntableObservations:
+    return _with_places(observations, [p.turntable_angle_rad * factor for p in observations.places])
+
+
+def _with_places(observations: TurntableObservations, readings: list[float]) -> TurntableObservations:
+    places = [replace(p, turntable_angle_rad=r) for p, r in zip(observations.places, readings, strict=True)]
+    return replace(observations, places=tuple(places))
+
+
