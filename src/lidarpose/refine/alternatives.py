@@ -1,7 +1,7 @@
-"""What if a file meant something else? Sessions whose parts contradict each other are tried under other readings of them.
+"""What if a file meant something else? Sessions that contradict themselves are tried under other readings of them.
 
-Units, panels and the order of scans are tried one at a time, from a start of their own, on a part of the places and rows. The
-alternative under which the contradiction is gone is named.
+Units, panels and the order of scans are tried one at a time, from a start of their own, on a part of the places and
+rows. The alternative under which the contradiction is gone is named.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ import numpy as np
 
 from lidarpose.errors import UndeterminedError
 from lidarpose.model.observation import PanelCorners, PlaceObservation, ScanLine, StripePoints, TurntableObservations
-from lidarpose.refine.turntable_joint import JointOptions, Solution, Start, lines_of, solve_joint
+from lidarpose.model.turntable_result import Kind
+from lidarpose.refine.turntable_joint import JointOptions, Solution, lines_of, solve_joint
 from lidarpose.refine.turntable_model import lay_out, start_state
 
-_MOST_PLACES = 31
-_MOST_ROWS = 60
-_CLEARLY_BETTER = 60.0
+_MOST_PLACES = 9
+_MOST_ROWS = 50
+_CLEARLY_BETTER = 2.0
 _FAR_M = 60.0
 
 
@@ -56,26 +57,39 @@ def explain_by_alternative(observations: TurntableObservations, options: JointOp
         return None
     part = thinned_observations(observations)
     now = _try(part, options)
-    best: tuple[float, str] | None = None
+    lines = float(sum(len(p.stripes) + len(p.scan_lines) for p in part.places))
+    if now is not None and now[1]:
+        return None
     for alternative in alternatives(part):
         score = _try(alternative.observations, options)
-        if score is not None and (best is None or score < best[0]):
-            best = (score, alternative.text)
-    if best is None or (now is not None and best[0] > now - _CLEARLY_BETTER):
-        return None
-    return best[1]
+        if score is not None and score[1] and (now is None or score[0] < now[0] - _CLEARLY_BETTER * lines):
+            return alternative.text
+    return None
 
 
-def _try(observations: TurntableObservations, options: JointOptions) -> float | None:
-    """Misfit under one reading of the files; None where it gives no sound solution."""
+def _try(observations: TurntableObservations, options: JointOptions) -> tuple[float, bool] | None:
+    """Misfit under one reading of the files, and whether it is sound; None where it gives no solution."""
     assert options.restart is not None
     try:
         motion, panels = options.restart(observations)
         data = lay_out(observations, use_stripes=options.use_stripes)
-        solution = solve_joint(data, start_state(data, motion, panels), replace(options, estimate=(), max_iterations=30))
+        solution = solve_joint(
+            data, start_state(data, motion, panels), replace(options, estimate=(), max_iterations=20)
+        )
     except (UndeterminedError, ValueError, np.linalg.LinAlgError):
         return None
-    return misfit(solution)
+    return misfit(solution), solution.converged and _sound(solution)
+
+
+_SOUND: dict[Kind, float] = {"stripes": 0.5, "ranges": 0.004}
+
+
+def _sound(solution: Solution) -> bool:
+    """Whether whole lines fit to half a pixel and 4 mm: an alternative that does not explains nothing."""
+    kinds = solution.noise.lines.items()
+    if any(np.sqrt(noise.place_variance) > _SOUND[kind] for kind, noise in kinds):
+        return False
+    return all((noise.line_weights == 0.0).mean() < 0.1 for _, noise in kinds)
 
 
 def alternatives(observations: TurntableObservations) -> Iterator[Alternative]:
@@ -144,12 +158,17 @@ def _panels(observations: TurntableObservations) -> Iterator[Alternative]:
 def _order(observations: TurntableObservations) -> Iterator[Alternative]:
     """Scans against everything else: reversed in time, or some places late."""
     places = observations.places
+    yield from _halves(observations)
     scans = [p.scan_lines for p in places]
     reverse = [replace(p, scan_lines=s) for p, s in zip(places, scans[::-1], strict=True)]
     yield Alternative(
         "the scans are in the opposite order of the stripe images (reversed scans)",
         replace(observations, places=tuple(reverse)),
     )
+
+
+def _halves(observations: TurntableObservations) -> Iterator[Alternative]:
+    places = observations.places
     first = len(places) // 2
     for half, which in ((slice(first, None), "second"), (slice(0, first), "first")):
         flipped = list(places)
@@ -172,7 +191,7 @@ def _flipped(place: PlaceObservation) -> PlaceObservation:
 
 
 def thinned_observations(observations: TurntableObservations) -> TurntableObservations:
-    """At most 31 places and 60 rows a line: enough to see whether parts contradict each other."""
+    """At most 9 places and 50 rows a line: enough to see whether parts contradict each other."""
     index = np.unique(np.linspace(0, len(observations.places) - 1, _MOST_PLACES).round().astype(int))
     places = tuple(_thin_place(observations.places[int(i)]) for i in index)
     return replace(observations, places=places)
@@ -202,9 +221,7 @@ def _mapped(
 
 
 def _with_lines(observations: TurntableObservations, change: Callable[[ScanLine], ScanLine]) -> TurntableObservations:
-    return _mapped(
-        observations, lambda p: replace(p, scan_lines={k: change(line) for k, line in p.scan_lines.items()})
-    )
+    return _mapped(observations, lambda p: replace(p, scan_lines={k: change(line) for k, line in p.scan_lines.items()}))
 
 
 def _scaled_ranges(factor: float) -> Callable[[ScanLine], ScanLine]:
@@ -233,3 +250,25 @@ def _with_places(observations: TurntableObservations, readings: list[float]) -> 
     return replace(observations, places=tuple(places))
 
 
+def duplicates(observations: TurntableObservations) -> tuple[str, ...]:
+    """Places at different readings with the very same scan or stripe: a file was copied, or a sensor stood still."""
+    found = []
+    for what in ("scan", "stripe"):
+        seen: dict[bytes, PlaceObservation] = {}
+        pairs = []
+        for place in observations.places:
+            parts = [s.range_m for s in place.scan_lines.values()]
+            if what == "stripe":
+                parts = [s.pixels.ravel() for s in place.stripes.values()]
+            if not parts or sum(len(p) for p in parts) < 10:
+                continue
+            key = np.concatenate(parts).tobytes()
+            first = seen.setdefault(key, place)
+            if first is not place and abs(first.turntable_angle_rad - place.turntable_angle_rad) > 1e-6:
+                pairs.append((first.position, place.position))
+        if pairs:
+            more = f" and {len(pairs) - 1} more" if len(pairs) > 1 else ""
+            found.append(
+                f"positions {pairs[0][0]} and {pairs[0][1]}{more} have the very same {what} at different readings"
+            )
+    return tuple(found)

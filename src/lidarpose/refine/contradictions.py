@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.model.turntable_result import Kind
 from lidarpose.refine.least_squares import NormalEquations
 from lidarpose.refine.turntable_joint import Solution, all_moments, lines_of, reduced_moments
@@ -58,8 +58,8 @@ class _LineTerms:
     own : (S, 12, 12), gradient : (S, 12), cross : (S, 12, n) with the active parameters.
     """
 
-    place: FloatArray
-    panel: FloatArray
+    place: IntArray
+    panel: IntArray
     kind: tuple[Kind, ...]
     own: FloatArray
     gradient: FloatArray
@@ -74,9 +74,12 @@ def line_terms(solution: Solution) -> _LineTerms:
         _terms_of_kind(solution, kind, reduced_moments(m, solution.noise.lines[kind])) for kind, m in moments.items()
     ]
     return _LineTerms(
-        *(np.concatenate([getattr(p, name) for p in parts]) for name in ("place", "panel")),
+        np.concatenate([p.place for p in parts]),
+        np.concatenate([p.panel for p in parts]),
         tuple(k for p in parts for k in p.kind),
-        *(np.concatenate([getattr(p, name) for p in parts]) for name in ("own", "gradient", "cross")),
+        np.concatenate([p.own for p in parts]),
+        np.concatenate([p.gradient for p in parts]),
+        np.concatenate([p.cross for p in parts]),
     )
 
 

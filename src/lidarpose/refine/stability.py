@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray
@@ -9,7 +11,19 @@ from lidarpose.refine.least_squares import add_lines, covariance_and_condition
 from lidarpose.refine.turntable_estimate import OutsideParameters
 from lidarpose.refine.turntable_joint import Moments, Solution, all_moments, lines_of, reduced_moments
 from lidarpose.refine.turntable_model import N_GLOBAL, N_MOTION, motion_map
-from lidarpose.refine.verdict import Stability, stability_ratio
+
+
+@dataclass(frozen=True)
+class Stability:
+    """How far the pose inside the arc moves when a part of the places is left out.
+
+    `ratio`: that move, in units of the standard deviation that it should have.
+    """
+
+    shift_mm: float
+    turn_deg: float
+    ratio: float
+    without: str
 
 
 def leave_places_out(solution: Solution, outside: OutsideParameters, parts: int = 4) -> Stability | None:
@@ -61,3 +75,13 @@ def _without(solution: Solution, reduced: Moments, gone: BoolArray) -> tuple[Flo
     change = covariance @ (solution.equations.gradient[use] - gradient[use])
     change = change - solution.covariance @ solution.equations.gradient[use]
     return change, covariance - solution.covariance
+
+
+def stability_ratio(change: FloatArray, expected: FloatArray) -> float:
+    """Size of a change (6,) of the pose in units of what its covariance (6, 6) lets expect, per degree of freedom."""
+    values, vectors = np.linalg.eigh(expected)
+    keep = values > 1e-9 * max(float(values[-1]), 1e-300)
+    if not keep.any():
+        return 0.0
+    along = vectors[:, keep].T @ change
+    return float(np.sqrt((along**2 / values[keep]).sum() / keep.sum()))

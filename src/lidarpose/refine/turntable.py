@@ -7,11 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.observation import TurntableObservations
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_result import ExtraParameter, TurntableEstimate
+from lidarpose.refine.alternatives import duplicates, explain_by_alternative
+from lidarpose.refine.contradictions import drift, explanations
 from lidarpose.refine.observability import pose_spread, weak_directions, whole_turn
 from lidarpose.refine.stability import leave_places_out
 from lidarpose.refine.turntable_estimate import (
@@ -62,7 +65,7 @@ def refine_turntable(
     plain = replace(options, estimate=())
     solution = solve_joint(data, start, plain)
     outside = outside_parameters(solution)
-    require_determined(solution, outside)
+    _require_determined(observations, solution, outside, options)
     refused: dict[str, str] = {}
     if options.estimate:
         chosen, refused = _observable(solution, options)
@@ -72,6 +75,21 @@ def refine_turntable(
             require_determined(solution, outside)
         options = replace(options, estimate=chosen)
     return _assemble(observations, solution, outside, options, refused)
+
+
+def _require_determined(
+    observations: TurntableObservations, solution: Solution, outside: OutsideParameters, options: JointOptions
+) -> None:
+    """Raise UndeterminedError, with the fault in the files that causes it where one can be named."""
+    try:
+        require_determined(solution, outside)
+    except UndeterminedError as error:
+        cause = explain_by_alternative(observations, options) if options.search_alternatives else None
+        if cause is None:
+            raise
+        raise UndeterminedError(
+            f"the files contradict each other: {cause}", remedy="Mend the session's files", details=(error.what,)
+        ) from error
 
 
 _LARGEST_SIGMA: dict[str, float] = {
@@ -108,7 +126,7 @@ def _assemble(
     options: JointOptions,
     refused: Mapping[str, str],
 ) -> TurntableEstimate:
-    data, C = solution.data, outside.covariance[:10, :10]
+    data, C, camera = solution.data, outside.covariance[:10, :10], solution.data.camera
     angles = data.angles_rad
     inside_at = np.unique([angles.min(), data.reference_rad, angles.max()])
     inside = pose_spread(outside.motion, C, inside_at)
@@ -129,7 +147,17 @@ def _assemble(
         stability=leave_places_out(solution, outside),
         directions=directions,
         places=len(observations.places),
+        duplicates=duplicates(observations),
+        drift=drift(solution),
+        explanations=explanations(solution),
+        mirrored_centre_px=(camera.width - 1 - 2.0 * camera.cx, camera.height - 1 - 2.0 * camera.cy),
     )
+    quality = judge(evidence)
+    if quality.verdict == "rejected" or not solution.converged:
+        cause = explain_by_alternative(observations, options) if options.search_alternatives else None
+        if cause is not None:
+            evidence = replace(evidence, findings=(cause,))
+            quality = judge(evidence)
     return TurntableEstimate(
         motion=outside.motion,
         panel_poses=panel_poses(solution, observations),
@@ -144,8 +172,8 @@ def _assemble(
         condition_number=solution.condition_number,
         directions=directions,
         extras=extras,
-        quality=judge(evidence),
-        findings=tuple(evidence.findings),
+        quality=quality,
+        findings=(*evidence.findings, *evidence.duplicates),
         reading_scale=float(1.0 + solution.state.extras[0]),
         extra_values={n: float(solution.state.extras[EXTRAS.index(n)]) for n in options.estimate},
     )

@@ -536,7 +536,8 @@ def _stripe_products(rows: StripeRows, R_panel: FloatArray, light_normal: FloatA
     """Products (14, N) of each row's ray and its derivatives with its line's vectors.
 
     The ray and its derivatives by a pixel, the focal scale and the principal point, each with the panel's normal and
-    with the light plane's (S, 3); last the ray and its derivative by a pixel with the panel's two axes. One small matrix product a line.
+    with the light plane's (S, 3); last the ray and its derivative by a pixel with the panel's two axes. One small
+    matrix product a line.
     """
     joined = np.concatenate([rows.rays, *(getattr(rows, name) for name in RAY_DERIVATIVES)], axis=1)
     factors = np.zeros((rows.lines.count, 15, 14))

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.calibration import Quality, Verdict
 from lidarpose.model.turntable_result import Direction, ExtraParameter, Kind, NoiseEstimate
+from lidarpose.refine.contradictions import Drift, Explanation
 from lidarpose.refine.observability import PoseSpread
+from lidarpose.refine.stability import Stability
 
 _DOUBTFUL: dict[Kind, float] = {"corners": 0.7, "stripes": 1.0, "ranges": 0.015}
 _REJECTED: dict[Kind, float] = {"corners": 3.0, "stripes": 4.0, "ranges": 0.1}
@@ -44,16 +45,6 @@ _TOLERATED: dict[str, float] = {
 }
 
 
-@dataclass(frozen=True)
-class Stability:
-    """How far the pose inside the arc moves when a part of the places is left out, and how far it should at most."""
-
-    shift_mm: float
-    turn_deg: float
-    ratio: float
-    without: str
-
-
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """Everything that the verdict looks at."""
@@ -71,7 +62,11 @@ class Evidence:
     stability: Stability | None
     directions: Sequence[Direction]
     findings: Sequence[str] = ()
+    duplicates: Sequence[str] = ()
     places: int = 0
+    drift: Drift | None = None
+    explanations: Sequence[Explanation] = ()
+    mirrored_centre_px: tuple[float, float] = (0.0, 0.0)
 
 
 class _Judge:
@@ -92,12 +87,16 @@ def judge(evidence: Evidence) -> Quality:
     jury = _Judge()
     for finding in evidence.findings:
         jury.object(2, finding)
+    for same in evidence.duplicates:
+        jury.object(1, same)
+    if not evidence.findings:
+        _judge_explanations(jury, evidence)
     if not evidence.converged:
         jury.object(1, "the estimate did not converge")
     for kind, noise in evidence.noise.items():
         _judge_noise(jury, kind, noise, evidence)
     _judge_left_out(jury, evidence)
-    _judge_extras(jury, evidence)
+    _judge_drift(jury, evidence)
     _judge_size(jury, evidence)
     _judge_stability(jury, evidence)
     return Quality(_ORDER[jury.level], tuple(jury.reasons), _figures(evidence))
@@ -138,19 +137,59 @@ def _judge_left_out(jury: _Judge, evidence: Evidence) -> None:
             jury.note(f"note: {share:.0%} of the {_WHAT[kind]} were left out as outliers")
 
 
-def _judge_extras(jury: _Judge, evidence: Evidence) -> None:
-    """Only the extra that explains the residuals best is named: they resemble each other."""
-    tested = [e for e in evidence.extras if not e.estimated and e.observable]
-    called = [e for e in tested if abs(e.value) > 5.0 * e.sigma]
-    if not called:
+_DRIFT_DOUBTFUL, _DRIFT_REJECTED = 8.0, 400.0
+_SURE = 5.0
+
+
+def _judge_drift(jury: _Judge, evidence: Evidence) -> None:
+    if evidence.drift is None or evidence.drift.ratio < _DRIFT_DOUBTFUL:
         return
-    best = max(called, key=lambda e: abs(e.value) / e.sigma)
-    large = abs(best.value) > _TOLERATED[best.name]
-    text = f"{EXTRA_WORDS[best.name]}: {describe_extra(best)}"
-    if large:
-        jury.object(1, text)
-    elif best.suggested:
+    level = 2 if evidence.drift.ratio > _DRIFT_REJECTED else 1
+    jury.object(
+        level,
+        "what lines are off by changes smoothly over the arc, "
+        f"{evidence.drift.ratio:.0f} times as much as from place to place: the geometry does not fit",
+    )
+
+
+def _judge_explanations(jury: _Judge, evidence: Evidence) -> None:
+    """Of the single changes that would explain misfit only the best is named: they resemble each other."""
+    candidates: list[tuple[float, int, str]] = []
+    for extra in evidence.extras:
+        if extra.estimated or not extra.observable or abs(extra.value) <= _SURE * extra.sigma:
+            continue
+        large = abs(extra.value) > _TOLERATED[extra.name]
+        text = f"{EXTRA_WORDS[extra.name]}: {describe_extra(extra)}{_mirror_hint(extra, evidence)}"
+        if not large and not extra.suggested:
+            continue
+        candidates.append(((extra.value / extra.sigma) ** 2 - _price(1), 1 if large else 0, text))
+    for e in evidence.explanations:
+        matters = 1e3 * e.shift_m > 0.25 * evidence.want_mm or np.rad2deg(e.turn_rad) > 0.25 * evidence.want_deg
+        if e.strength > _SURE and matters:
+            candidates.append((e.fall - _price(e.freedom) - _SEARCH_PRICE.get(e.key, 0.0), 1, e.text))
+    if not candidates:
+        return
+    _, level, text = max(candidates)
+    if level:
+        jury.object(level, text)
+    else:
         jury.note(f"note: {text}; it can be estimated")
+
+
+_SEARCH_PRICE = {"moved-board": 8.0, "slip": 8.0}
+
+
+def _price(freedom: int) -> float:
+    """What each further number has to earn before it is believed (Schwarz, 1978, with some 300 lines)."""
+    return 5.7 * freedom
+
+
+def _mirror_hint(extra: ExtraParameter, evidence: Evidence) -> str:
+    axis = {"centre_x_px": 0, "centre_y_px": 1}.get(extra.name)
+    if axis is None or abs(evidence.mirrored_centre_px[axis]) < _TOLERATED[extra.name]:
+        return ""
+    near = abs(extra.value - evidence.mirrored_centre_px[axis]) < max(4.0 * extra.sigma, 2.0)
+    return "; just what a mirrored image would show" if near else ""
 
 
 def describe_extra(extra: ExtraParameter) -> str:
@@ -200,6 +239,7 @@ def _figures(evidence: Evidence) -> dict[str, Any]:
         "want_mm": evidence.want_mm,
         "want_deg": evidence.want_deg,
         "places": evidence.places,
+        "drift_ratio": None if evidence.drift is None else evidence.drift.ratio,
         "noise": {
             kind: {
                 "unit": "mm" if kind == "ranges" else "px",
@@ -247,13 +287,3 @@ def suggested(extra: ExtraParameter, effect: tuple[float, float], inside: PoseSp
         return False
     shift, turn = effect
     return bool(shift > 0.5 * inside.position_m.max() or turn > 0.5 * inside.rotation_rad.max())
-
-
-def stability_ratio(change: FloatArray, expected: FloatArray) -> float:
-    """Size of a change (6,) of the pose in units of what its covariance (6, 6) lets expect, per degree of freedom."""
-    values, vectors = np.linalg.eigh(expected)
-    keep = values > 1e-9 * max(float(values[-1]), 1e-300)
-    if not keep.any():
-        return 0.0
-    along = vectors[:, keep].T @ change
-    return float(np.sqrt((along**2 / values[keep]).sum() / keep.sum()))
