@@ -53,7 +53,7 @@ def test_equal_seeds_give_equal_sessions_and_noise_is_as_asked() -> None:
 def test_a_pose_of_ones_own() -> None:
     pose = Pose(np.eye(3), np.array([4.0, 5.0, 1.2]))
     session, truth = simulate_corner_session(CornerSceneSpec(pose=pose, frames=1, places=3))
-    assert truth.T_world_lidar is pose
+    np.testing.assert_allclose(truth.T_world_lidar.matrix, pose.matrix, atol=1e-12)
     assert len(session.places) == 3
     with pytest.raises(ValueError, match="no pose"):
         simulate_corner_session(CornerSceneSpec(pose="7"))

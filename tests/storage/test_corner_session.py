@@ -73,3 +73,13 @@ def test_a_wrong_key_in_the_description_is_named(folder: Path) -> None:
 def test_a_session_is_not_overwritten(folder: Path) -> None:
     with pytest.raises(InputError, match="already holds a session"):
         write_corner_session(folder, read_corner_session(folder))
+
+
+def test_a_simulation_is_replaced_with_its_truth(folder: Path) -> None:
+    session = read_corner_session(folder)
+    loaded = [source.load() for place in session.places for source in place.clouds]
+    assert loaded
+    folder.with_name(folder.name + ".truth.json").write_text("{}")
+    write_corner_session(folder, session)
+    assert len(read_corner_session(folder).places) == len(session.places)
+    assert not folder.with_name(folder.name + ".truth.json").exists()

@@ -25,6 +25,7 @@ def simulate_corners(
     dropout: Annotated[float, Parameter(validator=validators.Number(gte=0.0, lt=1.0))] = 0.02,
     seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0,
     suffix: Literal[".pcd", ".ply", ".las", ".laz", ".e57", ".npy"] = ".pcd",
+    force: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:
     """Simulate a session in which a target of three faces is moved from place to place.
 
@@ -58,6 +59,8 @@ def simulate_corners(
         The same seed gives the same session.
     suffix
         Format of the clouds.
+    force
+        Replace a session that no simulation wrote.
     """
     import json
 
@@ -67,6 +70,7 @@ def simulate_corners(
     from lidarpose.storage.atomic import write_text
     from lidarpose.storage.calibration import transform_entry
     from lidarpose.storage.corner_session import corner_truth_document, write_corner_session
+    from lidarpose.storage.truth import truth_path
 
     spec = CornerSceneSpec(
         pose=pose,
@@ -82,11 +86,11 @@ def simulate_corners(
         defects=Defects(range_sigma_m, dropout),
     )
     session, truth = simulate_corner_session(spec)
-    write_corner_session(out, session, suffix=suffix)
+    write_corner_session(out, session, suffix=suffix, force=force)
     positions = [
         {"position": p.position, "corner_world_m": w.tolist(), "corner_m": c.tolist()}
         for p, w, c in zip(session.places, truth.corners_world, truth.corners_lidar, strict=True)
     ]
     document = corner_truth_document(transform_entry("world", session.cloud_frame, truth.T_world_lidar), positions)
-    write_text(Path(f"{out}.truth.json"), json.dumps(document, indent=2) + "\n")
-    console().print(f"{out}: {places} places, {frames} frames each; truth in {out}.truth.json")
+    write_text(truth_path(out), json.dumps(document, indent=2) + "\n")
+    console().print(f"{out}: {places} places, {frames} frames each; truth in {truth_path(out).name}")

@@ -16,12 +16,14 @@ from lidarpose.geometry.se3 import Pose
 from lidarpose.model.calibration import WorldCalibration
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.corner_session import CornerPlace, CornerSession
-from lidarpose.storage.atomic import write_text
+from lidarpose.storage.atomic import replacing_folder, restore_folder, write_text
 from lidarpose.storage.calibration import read_calibration
 from lidarpose.storage.documents import Schema, check_format, parse, read_toml
 from lidarpose.storage.provenance import provenance
 from lidarpose.storage.session import LidarSection, inside
+from lidarpose.storage.session_folder import check_free
 from lidarpose.storage.tables import TextTable, read_text_table
+from lidarpose.storage.truth import truth_path
 
 CORNER_SESSION_FORMAT = "lidarpose/corner-session@1"
 CLOUD_SUFFIXES = (".pcd", ".ply", ".las", ".laz", ".e57", ".npy")
@@ -144,18 +146,24 @@ def _find_clouds(folder: Path, file: Path, line: int, pattern: str) -> Iterator[
         yield FileCloud(path, path.relative_to(folder).as_posix())
 
 
-def write_corner_session(folder: Path, session: CornerSession, *, suffix: str = ".pcd") -> None:
-    """Write a session as a folder: clouds first, its description last, so that a broken-off write is no session.
+def write_corner_session(folder: Path, session: CornerSession, *, suffix: str = ".pcd", force: bool = False) -> None:
+    """Write a session as a folder, whole or not at all. The truth of an earlier simulation beside it is removed.
 
     Raises
     ------
     InputError
-        If the folder already holds a session, or cannot be written to.
+        If the folder holds something else (see `lidarpose.storage.session_folder`), or cannot be written to.
     """
+    restore_folder(folder)
+    check_free(folder, CORNER_SESSION_FORMAT, force=force)
+    with replacing_folder(folder) as temporary:
+        _write_files(temporary, session, suffix)
+        truth_path(folder).unlink(missing_ok=True)
+
+
+def _write_files(folder: Path, session: CornerSession, suffix: str) -> None:
     from lidarpose.storage.clouds import write_cloud
 
-    if (folder / "session.toml").exists():
-        raise InputError(folder, "already holds a session", remedy="Name another folder, or remove this one.")
     rows = []
     for index, place in enumerate(session.places):
         sub = f"clouds/p{index:02d}"
@@ -196,7 +204,7 @@ def session_provenance(folder: Path, session: CornerSession, options: Mapping[st
 
 def truth_beside(folder: Path) -> Pose | None:
     """The true pose that a simulation left beside its session, as FOLDER.truth.json; None where there is none."""
-    file = folder.with_name(folder.name + ".truth.json")
+    file = truth_path(folder)
     if not file.is_file():
         return None
     calibration = read_calibration(file)

@@ -17,6 +17,8 @@ from lidarpose.model.scan import Scan
 from lidarpose.model.session import DEFAULT_PLACEMENT, TurntablePlace, TurntableSession
 from lidarpose.storage.atomic import replacing_folder, restore_folder, write_text
 from lidarpose.storage.camera_info import write_camera_info
+from lidarpose.storage.session_folder import check_free
+from lidarpose.storage.truth import truth_path
 
 SESSION_FORMAT = "lidarpose/turntable-session@1"
 
@@ -56,41 +58,16 @@ def write_turntable_session(
         If the folder holds something else, or cannot be written to.
     """
     folder = Path(folder)
-    truth_path = _truth_path(folder)
     restore_folder(folder)
-    _check_free(folder, truth_path, force)
+    check_free(folder, SESSION_FORMAT, force=force)
     with replacing_folder(folder) as temporary:
         _write_files(temporary, session, step or (lambda: None))
         write_text(temporary / "positions.csv", _positions_text(session))
         write_camera_info(temporary / "camera.yaml", session.camera)
         write_text(temporary / "session.toml", _session_text(session))
-        truth_path.unlink(missing_ok=True)
+        truth_path(folder).unlink(missing_ok=True)
     if truth is not None:
-        write_text(truth_path, json.dumps(truth, indent=1, allow_nan=False) + "\n")
-
-
-def _truth_path(folder: Path) -> Path:
-    whole = folder.resolve()
-    return whole.with_name(whole.name + ".truth.json")
-
-
-def _check_free(folder: Path, truth_path: Path, force: bool) -> None:
-    try:
-        if not folder.exists():
-            return
-        if not folder.is_dir():
-            raise InputError(folder, "is a file", expected="the name of a folder to write")
-        if not any(folder.iterdir()):
-            return
-        description = folder / "session.toml"
-        if not (description.is_file() and SESSION_FORMAT in description.read_text("utf-8", errors="replace")):
-            raise InputError(folder, "is not empty and no turntable session", remedy="Name a new folder.")
-    except OSError as error:
-        raise InputError(folder, f"cannot be read: {error.strerror or error}") from error
-    if not (force or truth_path.is_file()):
-        raise InputError(
-            folder, "already holds a session, which may be a recording", remedy="Name a new folder, or say --force."
-        )
+        write_text(truth_path(folder), json.dumps(truth, indent=1, allow_nan=False) + "\n")
 
 
 def _images(session: TurntableSession) -> Iterator[tuple[str, ImageSource]]:
