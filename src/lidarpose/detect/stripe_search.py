@@ -19,6 +19,11 @@ _DRAWS = np.random.default_rng(0).random((2, 80))
 _AMBIGUOUS = 0.5
 # A stripe, saturated or not, is narrower than twice this many reduced pixels.
 _RIDGE_REACH = 4
+_TWO_LINES = "two lines of light on the panel, and nothing tells which one is the laser's"
+# A lit stripe image of which the bright image explains less than this much of the squares' contrast shows the board
+# elsewhere.
+_UNEXPLAINED = 0.3
+_LIT_LEVELS = 8.0
 # Pixels between the places where grid coordinates are computed; between them they are interpolated (to 0.01 px).
 _NODE_STEP = 8
 # Reduced pixels of each colour that tell the ambient light.
@@ -70,7 +75,9 @@ class PanelView:
         small = reduce_image(part, factor)
         nodes, slopes = _nodes(albedo, low, high)
         grid = interpolate(nodes, *_pixel_centres(small.shape, factor))
-        inside = albedo.is_usable(grid)
+        # Without the rim, where what lies around the board shines in.
+        usable = np.pad(albedo.is_usable(grid), 1).astype(np.uint8)
+        inside = cv2.erode(usable, np.ones((5, 5), np.uint8))[1:-1, 1:-1].astype(bool)
         away = inside & (np.abs(grid - np.round(grid)).min(axis=-1) > 0.2)
         share = albedo.light_share(grid[..., 0], grid[..., 1], np.array(0.01), np.array(0.01))
         light, dark = (np.flatnonzero(away & side) for side in (share > 0.5, share <= 0.5))
@@ -178,11 +185,14 @@ def find_line(view: PanelView, image: GrayImage) -> CoarseLine | str:
 
 def has_line(view: PanelView) -> bool:
     """Whether the bright image itself has a line of light on the panel: a stripe that must not pass for albedo."""
-    return not isinstance(_find_in_reduced(view, view.small_bright, view.small_model()), str)
+    found = _find_in_reduced(view, view.small_bright, view.small_model())
+    return not isinstance(found, str) or found == _TWO_LINES
 
 
 def _find_in_reduced(view: PanelView, small: FloatArray, template: FloatArray) -> CoarseLine | str:
     rest, share = _without_ambient(view, small, template)
+    if _is_elsewhere(view, rest, small):
+        return "the board is not where the bright images show it: it or the camera was moved"
     ridges = (_ridge(rest), _ridge(rest.T))
     threshold = max(6.0 * _noise(view, ridges), 1.5)
     first = _best_line(ridges, threshold)
@@ -195,8 +205,17 @@ def _find_in_reduced(view: PanelView, small: FloatArray, template: FloatArray) -
         _erase(ridge, line, steep)
     second = _best_line(ridges, max(threshold, 0.3 * line.level))
     if second is not None and second[1] > _AMBIGUOUS * support:
-        return "two lines of light on the panel, and nothing tells which one is the laser's"
+        return _TWO_LINES
     return _to_image(line, view, share)
+
+
+def _is_elsewhere(view: PanelView, rest: FloatArray, small: FloatArray) -> bool:
+    """Whether squares are seen, but not these: what the bright image leaves is as strong as their contrast."""
+    inner = np.concatenate([view.light, view.dark])
+    if len(inner) == 0:
+        return False
+    low, high = np.percentile(small.ravel()[inner], [20.0, 80.0])
+    return bool(high - low > _LIT_LEVELS and np.median(np.abs(rest.ravel()[inner])) > _UNEXPLAINED * (high - low))
 
 
 def _ridge(field: FloatArray) -> FloatArray:
