@@ -8,16 +8,18 @@ measured on the squares' edges.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
 
 from lidarpose.detect.grid_map import GridMap
-from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.model.image import GrayImage
 
+# How much of a light margin around the squares is used, in squares: boards may end soon after.
+MARGIN = 0.9
 # Inside a square, away from its blurred edges, as fractions of it.
 _INNER = np.linspace(0.25, 0.75, 5)
 _SQRT2 = np.sqrt(2.0)
@@ -30,6 +32,7 @@ class PanelAlbedo:
     """A panel's squares as the bright image shows them.
 
     Squares are counted from the outer ring: square (i, j) reaches from grid coordinate i - 1 to i, and j - 1 to j.
+    Around them may lie a light margin: `MARGIN` squares wide it is used where the bright image shows it.
 
     Attributes
     ----------
@@ -37,8 +40,9 @@ class PanelAlbedo:
         From grid coordinates (squares) to pixels.
     light, dark : (rows + 1, columns + 1)
         Grey level that a light, and a dark, surface has at each square's place.
-    usable : (rows + 1, columns + 1)
-        False for squares that are not as a chessboard's are (cut short, covered, glaring).
+    usable : (rows + 3, columns + 3)
+        False for squares that are not as a chessboard's are (cut short, covered, glaring); with a ring around them
+        for the margin, true where it is as light as the light squares.
     first_is_dark
         Whether the square before the first corner, at (0, 0), is dark.
     blur_px
@@ -63,16 +67,48 @@ class PanelAlbedo:
         Edges are blurred by Gaussians of width `edge_x`, `edge_y` squares. The blur is taken to be small against the
         squares, so that only the nearest edge each way matters.
         """
-        wave = soft_square_wave(x, edge_x) * soft_square_wave(y, edge_y)
-        return np.asarray(0.5 - 0.5 * wave if self.first_is_dark else 0.5 + 0.5 * wave)
+        columns, rows = self.grid_map.columns, self.grid_map.rows
+        inner_x, inner_y = np.clip(x, -0.5, columns - 0.5), np.clip(y, -0.5, rows - 0.5)
+        wave = soft_square_wave(inner_x, edge_x) * soft_square_wave(inner_y, edge_y)
+        share = 0.5 - 0.5 * wave if self.first_is_dark else 0.5 + 0.5 * wave
+        for value, edge, size in ((x, edge_x, columns), (y, edge_y, rows)):
+            reach = 4.0 * float(np.max(edge))
+            if float(np.min(value)) < -1.0 + reach:
+                share = 1.0 - (1.0 - share) * _soft_step(value + 1.0, edge)
+            if float(np.max(value)) > size - reach:
+                share = 1.0 - (1.0 - share) * _soft_step(size - value, edge)
+        return np.asarray(share)
 
     def is_usable(self, grid: FloatArray) -> BoolArray:
-        """True (...) for grid coordinates (..., 2) in squares that are as a chessboard's are."""
-        index = np.floor(grid + 1.0).astype(int)
-        rows, columns = self.usable.shape
-        inside = (index >= 0).all(-1) & (index[..., 0] < columns) & (index[..., 1] < rows)
-        safe = np.where(inside[..., None], index, 0)
-        return np.asarray(inside & self.usable[safe[..., 1], safe[..., 0]])
+        """True (...) for grid coordinates (..., 2) in squares that are as a chessboard's are, and in a light margin."""
+        size = np.array([self.grid_map.columns, self.grid_map.rows])
+        inside = ((grid > -1.0 - MARGIN) & (grid < size + MARGIN)).all(-1)
+        index = np.clip(np.floor(grid + 2.0).astype(int), 0, size + 2)
+        return np.asarray(inside & self.usable[index[..., 1], index[..., 0]])
+
+    def without_margin(self) -> PanelAlbedo:
+        """The same without the margin."""
+        return replace(self, usable=np.pad(self.usable[1:-1, 1:-1], 1))
+
+    def apart_from(self, other: FloatArray) -> PanelAlbedo:
+        """The same without the margin where it may be another panel's: within a polygon (M, 2) of pixels."""
+        usable = self.usable.copy()
+        rows, columns = usable.shape
+        polygon = other.astype(np.float32)
+        for j, i in np.argwhere(usable):
+            if 0 < i < columns - 1 and 0 < j < rows - 1:
+                continue
+            u, v = self.grid_map.pixels(_ring_centre(np.array([i, j]), np.array([columns, rows])))
+            if cv2.pointPolygonTest(polygon, (float(u), float(v)), False) >= 0:
+                usable[j, i] = False
+        return replace(self, usable=usable)
+
+
+def _ring_centre(index: IntArray, shape: IntArray) -> FloatArray:
+    """Grid coordinates (..., 2) of the middle of cells (..., 2) of `usable`; those of the ring are narrow."""
+    centre = index - 1.5
+    centre = np.where(index == 0, -1.0 - 0.5 * MARGIN, centre)
+    return np.asarray(np.where(index == shape - 1, shape - 3.0 + 0.5 * MARGIN, centre))
 
 
 @lru_cache(maxsize=1)
@@ -92,6 +128,13 @@ def soft_square_wave(x: FloatArray, sigma: FloatArray) -> FloatArray:
     return np.asarray(_erf_table()[index])
 
 
+def _soft_step(x: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Step from 0 (x < 0) to 1, blurred by a Gaussian (`sigma`)."""
+    scale = _ERF_STEPS / (_ERF_REACH * _SQRT2) / np.maximum(sigma, 1e-6)
+    index = np.clip(x * scale + (_ERF_STEPS + 0.5), 0, 2 * _ERF_STEPS).astype(np.intp)
+    return np.asarray(0.5 + 0.5 * _erf_table()[index])
+
+
 def measure_albedo(grid_map: GridMap, image: GrayImage | FloatArray) -> PanelAlbedo:
     """Levels, colour and blur of a panel's squares in a bright image (the mean or median of the shots)."""
     centres, medians = _square_medians(grid_map, image)
@@ -100,9 +143,27 @@ def measure_albedo(grid_map: GridMap, image: GrayImage | FloatArray) -> PanelAlb
     first_is_dark = bool(np.median(medians[~parity]) < np.median(medians[parity]))
     is_dark = ~parity if first_is_dark else parity
     light, dark = _fill(medians, ~is_dark), _fill(medians, is_dark)
-    usable = _as_expected(medians, is_dark, light, dark) & _in_image(centres, image.shape)
-    albedo = PanelAlbedo(grid_map, light, dark, usable, first_is_dark, 1.0)
-    return PanelAlbedo(grid_map, light, dark, usable, first_is_dark, _measure_blur(albedo, image))
+    squares = _as_expected(medians, is_dark, light, dark) & _in_image(centres, image.shape)
+    albedo = PanelAlbedo(grid_map, light, dark, _with_margin(grid_map, image, squares, light), first_is_dark, 1.0)
+    return replace(albedo, blur_px=_measure_blur(albedo, image))
+
+
+def _with_margin(grid_map: GridMap, image: GrayImage | FloatArray, squares: BoolArray, light: FloatArray) -> BoolArray:
+    """`squares` with a ring around them: where the margin is even and as light as the light squares beside it."""
+    rows, columns = squares.shape
+    usable = np.pad(squares, 1)
+    ring = np.argwhere(np.pad(np.zeros_like(squares), 1, constant_values=True))[:, ::-1]
+    shape = np.array([columns + 2, rows + 2])
+    centres = _ring_centre(ring, shape)
+    half = np.where((ring == 0) | (ring == shape - 1), 0.35 * MARGIN, 0.35)
+    spots = np.stack(np.meshgrid([-1.0, -0.5, 0.0, 0.5, 1.0], [-1.0, -0.5, 0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
+    pixels = grid_map.pixels(centres[:, None] + spots * half[:, None])
+    values = np.sort(sample(image, pixels), axis=1)
+    beside = np.clip(ring - 1, 0, [columns - 1, rows - 1])
+    level = light[beside[:, 1], beside[:, 0]]
+    even = (values[:, -3] - values[:, 2] < 0.15 * level) & (np.abs(values[:, 12] - level) < 0.2 * level)
+    usable[ring[:, 1], ring[:, 0]] = even & _in_image(pixels, image.shape).all(axis=1)
+    return usable
 
 
 def _square_medians(grid_map: GridMap, image: GrayImage | FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -186,7 +247,7 @@ def _edge_pixels(albedo: PanelAlbedo, image: GrayImage | FloatArray) -> tuple[Fl
     """Pixels around the middles of edges between usable squares: grid coordinates (M, 2), their gradient (M, 2, 2) by
     the pixel, and the value (M,) from 0 (dark) to 1 (light)."""
     grid_map = albedo.grid_map
-    usable = albedo.usable
+    usable = albedo.usable[1:-1, 1:-1]
     j, i = np.nonzero(usable[:, :-1] & usable[:, 1:])
     upright = np.column_stack([i, j - 0.5])
     j, i = np.nonzero(usable[:-1] & usable[1:])

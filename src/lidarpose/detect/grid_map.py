@@ -75,8 +75,8 @@ class GridMap:
 
     def _terms(self, grid: FloatArray) -> FloatArray:
         half = np.array([max(self.columns - 1, 1), max(self.rows - 1, 1)]) / 2.0
-        # Beyond the outer squares the bend stays as it is at their edge: a polynomial knows nothing out there.
-        reach = 1.0 + 1.5 / half
+        # Well beyond the outer squares the bend stays as it is at their edge: a polynomial knows nothing out there.
+        reach = 1.0 + 1.7 / half
         s, t = np.moveaxis(np.clip(grid / half - 1.0, -reach, reach), -1, 0)
         degree = _DEGREES[len(self.bend)]
         powers_s, powers_t = [np.ones_like(s)], [np.ones_like(t)]

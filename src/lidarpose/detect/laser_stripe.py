@@ -30,6 +30,9 @@ from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.image import GrayImage
 from lidarpose.model.observation import LeftOut, StripePoints
 
+# Margins within this many squares of another panel's inner corners are not used.
+_KEPT_APART = 3.0
+
 
 @dataclass(frozen=True)
 class StripeDetection:
@@ -56,8 +59,12 @@ class StripeFinder:
         self._shape = bright.shape
         self._limit = float(np.iinfo(bright_images[0].dtype).max)
         self._views: list[PanelView] = []
-        for grid_map in board.maps:
-            view = PanelView.make(measure_albedo(grid_map, bright), bright)
+        for k, grid_map in enumerate(board.maps):
+            albedo = measure_albedo(grid_map, bright)
+            for other in board.maps[:k] + board.maps[k + 1 :]:
+                # Which panel the margin between two panels belongs to is not known.
+                albedo = albedo.apart_from(other.outline(_KEPT_APART))
+            view = PanelView.make(albedo, bright)
             self._views.append(view.with_model() if has_line(view) else view)
 
     def find(self, image: GrayImage) -> StripeDetection:

@@ -330,7 +330,7 @@ def _look_at_albedo(band: _Band, view: PanelView, steep: bool, curve: _Curve, wi
     per_v = by_v * _column(cosine**2 * thickness + band.sine**2) + by_u * _column(
         (1.0 - thickness) * cosine * band.sine
     )
-    inside = _inside_squares(view, grid, slopes, width)
+    inside = _inside_squares(view, grid, across, width)
     shares = []
     for moved in (-_EDGE_STEP, _EDGE_STEP):
         x, y = (dv * per_v[:, k, None] + (grid[:, k] - moved * across[:, k])[:, None] for k in (0, 1))
@@ -339,15 +339,14 @@ def _look_at_albedo(band: _Band, view: PanelView, steep: bool, curve: _Curve, wi
     return replace(band, light=light, by_edge=by_edge, good=band.good * inside[:, None])
 
 
-def _inside_squares(view: PanelView, grid: FloatArray, slopes: FloatArray, width: float) -> FloatArray:
-    """1 for profiles (N,) whose light falls on usable squares alone: what lies around the board is not known."""
-    albedo = view.albedo
-    inside = albedo.is_usable(grid)
-    size = (albedo.grid_map.columns, albedo.grid_map.rows)
-    for k in (0, 1):
-        reach = 2.5 * width * np.hypot(slopes[:, 2 * k], slopes[:, 2 * k + 1])
-        inside &= (grid[:, k] > -1.0 + reach) & (grid[:, k] < size[k] - reach)
-    return inside.astype(np.float32)
+def _inside_squares(view: PanelView, grid: FloatArray, across: FloatArray, width: float) -> FloatArray:
+    """1 for profiles (N,) whose light falls on usable squares alone: what lies around the board is not known.
+
+    `across` (N, 2) is the change of the grid coordinates by a pixel across the stripe.
+    """
+    usable = view.albedo.is_usable
+    reach = 2.5 * width * across
+    return (usable(grid) & usable(grid - reach) & usable(grid + reach)).astype(np.float32)
 
 
 def _step(band: _Band, state: _State, curve: _Curve, *, learn: bool) -> _State:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from lidarpose.detect.albedo import PanelAlbedo
+from lidarpose.detect.albedo import MARGIN, PanelAlbedo
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.model.image import GrayImage
 
@@ -20,10 +20,13 @@ _AMBIGUOUS = 0.5
 # A stripe, saturated or not, is narrower than twice this many reduced pixels.
 _RIDGE_REACH = 4
 _TWO_LINES = "two lines of light on the panel, and nothing tells which one is the laser's"
-# A lit stripe image of which the bright image explains less than this much of the squares' contrast shows the board
-# elsewhere.
-_UNEXPLAINED = 0.3
-_LIT_LEVELS = 8.0
+# A lit stripe image shows the board elsewhere if it correlates with the bright image by less than this.
+_LEAST_CORRELATION = 0.5
+_LIT_SHARE = 0.3
+# Lines in the bright image itself must stand out more than the model of the squares errs, as a share of their contrast.
+_MISFIT = 0.12
+# Lines sharper than the one, and wider than the other, are told apart (see `_sharpness`).
+_NARROW, _WIDE = 0.65, 0.45
 # Pixels between the places where grid coordinates are computed; between them they are interpolated (to 0.01 px).
 _NODE_STEP = 8
 # Reduced pixels of each colour that tell the ambient light.
@@ -65,7 +68,7 @@ class PanelView:
     @staticmethod
     def make(albedo: PanelAlbedo, bright: GrayImage | FloatArray) -> PanelView:
         """From the panel's albedo and the whole bright image."""
-        outline = albedo.grid_map.outline()
+        outline = albedo.grid_map.outline(1.0 + MARGIN)
         height, width = bright.shape
         low = np.clip(np.floor(outline.min(axis=0)).astype(int), 0, [width, height])
         high = np.clip(np.ceil(outline.max(axis=0)).astype(int) + 1, 0, [width, height])
@@ -75,9 +78,7 @@ class PanelView:
         small = reduce_image(part, factor)
         nodes, slopes = _nodes(albedo, low, high)
         grid = interpolate(nodes, *_pixel_centres(small.shape, factor))
-        # Without the rim, where what lies around the board shines in.
-        usable = np.pad(albedo.is_usable(grid), 1).astype(np.uint8)
-        inside = cv2.erode(usable, np.ones((5, 5), np.uint8))[1:-1, 1:-1].astype(bool)
+        inside = _usable_pixels(albedo, grid)
         away = inside & (np.abs(grid - np.round(grid)).min(axis=-1) > 0.2)
         share = albedo.light_share(grid[..., 0], grid[..., 1], np.array(0.01), np.array(0.01))
         light, dark = (np.flatnonzero(away & side) for side in (share > 0.5, share <= 0.5))
@@ -104,9 +105,18 @@ class PanelView:
         return interpolate(self.nodes, u, v)[0], interpolate(self.slopes, u, v)[0]
 
     def with_model(self) -> PanelView:
-        """The same with the bright image as squares, levels and blur make it: without what else there is in it."""
+        """The same with the bright image as squares, levels and blur make it: without what else there is in it.
+
+        Without the margin too: the outer squares' outer edges are extrapolated, and lines of misfit may run along them.
+        """
         model = self._model(*_pixel_centres(self.bright.shape, 1), self.albedo.blur_px)
-        return replace(self, bright=model, small_bright=reduce_image(model, self.factor))
+        return replace(self.without_margin(), bright=model, small_bright=reduce_image(model, self.factor))
+
+    def without_margin(self) -> PanelView:
+        """The same without the margin around the squares."""
+        albedo = self.albedo.without_margin()
+        grid = interpolate(self.nodes, *_pixel_centres(self.small_bright.shape, self.factor))
+        return replace(self, albedo=albedo, small_mask=_usable_pixels(albedo, grid))
 
     def small_model(self) -> FloatArray:
         """The modelled bright image, reduced."""
@@ -121,6 +131,12 @@ class PanelView:
         share = self.albedo.light_share(grid[..., 0], grid[..., 1], edges[0], edges[1])
         light, dark = self.albedo.levels(grid)
         return np.asarray(dark + (light - dark) * share, dtype=np.float32)
+
+
+def _usable_pixels(albedo: PanelAlbedo, grid: FloatArray) -> BoolArray:
+    """Reduced pixels on usable ground, without the rim, where what lies around the board shines in."""
+    usable = np.pad(albedo.is_usable(grid), 1).astype(np.uint8)
+    return np.asarray(cv2.erode(usable, np.ones((5, 5), np.uint8))[1:-1, 1:-1] > 0)
 
 
 def _nodes(albedo: PanelAlbedo, low: IntArray, high: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -185,16 +201,18 @@ def find_line(view: PanelView, image: GrayImage) -> CoarseLine | str:
 
 def has_line(view: PanelView) -> bool:
     """Whether the bright image itself has a line of light on the panel: a stripe that must not pass for albedo."""
-    found = _find_in_reduced(view, view.small_bright, view.small_model())
+    squares = view.without_margin()
+    contrast = float(np.median(view.albedo.light - view.albedo.dark))
+    found = _find_in_reduced(squares, squares.small_bright, squares.small_model(), _MISFIT * contrast)
     return not isinstance(found, str) or found == _TWO_LINES
 
 
-def _find_in_reduced(view: PanelView, small: FloatArray, template: FloatArray) -> CoarseLine | str:
+def _find_in_reduced(view: PanelView, small: FloatArray, template: FloatArray, least: float = 1.5) -> CoarseLine | str:
     rest, share = _without_ambient(view, small, template)
-    if _is_elsewhere(view, rest, small):
+    if _is_elsewhere(view, small, template):
         return "the board is not where the bright images show it: it or the camera was moved"
     ridges = (_ridge(rest), _ridge(rest.T))
-    threshold = max(6.0 * _noise(view, ridges), 1.5)
+    threshold = max(6.0 * _noise(view, ridges), least)
     first = _best_line(ridges, threshold)
     if first is None:
         return "no stripe on the panel: nothing stands out in a line"
@@ -205,17 +223,49 @@ def _find_in_reduced(view: PanelView, small: FloatArray, template: FloatArray) -
         _erase(ridge, line, steep)
     second = _best_line(ridges, max(threshold, 0.3 * line.level))
     if second is not None and second[1] > _AMBIGUOUS * support:
-        return _TWO_LINES
+        chosen = _sharper(rest, line, second[0])
+        if chosen is None:
+            return _TWO_LINES
+        line = chosen
     return _to_image(line, view, share)
 
 
-def _is_elsewhere(view: PanelView, rest: FloatArray, small: FloatArray) -> bool:
-    """Whether squares are seen, but not these: what the bright image leaves is as strong as their contrast."""
+def _sharper(rest: FloatArray, a: _SmallLine, b: _SmallLine) -> _SmallLine | None:
+    """The one of two lines that is a narrow one beside a wide one (a long glare), if it is so."""
+    sharpness = [_sharpness(rest.T if line.steep else rest, line) for line in (a, b)]
+    if min(sharpness) > _WIDE or max(sharpness) < _NARROW:
+        return None
+    return a if sharpness[0] > sharpness[1] else b
+
+
+def _sharpness(field: FloatArray, line: _SmallLine) -> float:
+    """Share of the ridge's height that is lost within half of its reach: 1 for a narrow line, 1/4 for a wide one."""
+    x = np.arange(int(line.start), int(line.end) + 1)
+    middle = np.rint(line.intercept + line.slope * x).astype(int)
+    k = _RIDGE_REACH
+    kept = (middle >= k + 1) & (middle < field.shape[0] - k - 1)
+    x, middle = x[kept], middle[kept]
+    if len(x) == 0:
+        return 0.0
+    near = np.stack([field[middle + d, x] for d in (-1, 0, 1)])
+    middle = middle + np.argmax(near, axis=0) - 1
+    top = near.max(axis=0)
+    half, full = (top - np.maximum(field[middle - d, x], field[middle + d, x]) for d in (k // 2, k))
+    return float(np.median(half) / max(float(np.median(full)), 1e-6))
+
+
+def _is_elsewhere(view: PanelView, small: FloatArray, template: FloatArray) -> bool:
+    """Whether the image is lit, but shows other squares than these."""
     inner = np.concatenate([view.light, view.dark])
-    if len(inner) == 0:
+    if len(inner) < 10:
         return False
-    low, high = np.percentile(small.ravel()[inner], [20.0, 80.0])
-    return bool(high - low > _LIT_LEVELS and np.median(np.abs(rest.ravel()[inner])) > _UNEXPLAINED * (high - low))
+    seen, expected = small.ravel()[inner], template.ravel()[inner]
+    low, high = np.percentile(seen, [10.0, 80.0])
+    if high - low < _LIT_SHARE * float(np.percentile(expected, 80.0) - np.percentile(expected, 10.0)):
+        return False
+    # Clipped: a glare or the stripe itself must not decide.
+    correlation = np.corrcoef(np.clip(seen, low, high), expected)[0, 1]
+    return bool(correlation < _LEAST_CORRELATION)
 
 
 def _ridge(field: FloatArray) -> FloatArray:
