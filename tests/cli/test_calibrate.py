@@ -45,7 +45,8 @@ def test_people_get_a_table_and_the_verdict(
     text = capsys.readouterr().out
     assert "Table 1" in text
     assert "verdict: good" in text
-    assert "error against truth" in text
+    assert "Error against the truth" in text
+    assert "report.html" in text
 
 
 def test_the_same_input_gives_the_same_output(simulated_session: Path, tmp_path: Path) -> None:

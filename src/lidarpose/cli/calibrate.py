@@ -168,7 +168,8 @@ def _finish(run: TurntableRun, folder: Path, output: Path, *, with_report: bool,
     if json:
         print_json(summary(run, error))
     else:
-        print_summary(out(), run, error, output)
+        written = ["calibration.json", *(["report.html"] if with_report else [])]
+        print_summary(out(), run, error, [output / name for name in written])
     if run.left_out and not (json or quiet):
         err().print(f"{len(run.left_out)} features or places were left out; the report lists them with their reasons.")
     _refuse_if_rejected(run.calibration.quality)

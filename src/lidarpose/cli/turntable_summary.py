@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lidarpose.report.summary import figures_table, print_verdict
+from lidarpose.report.turntable_page import turntable_verdict
+
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from lidarpose.model.calibration import Verdict
     from lidarpose.model.turntable_run import Deviation, TruthError, TurntableRun
-
-_COLOURS: dict[Verdict, str] = {"good": "bold green", "doubtful": "bold yellow", "rejected": "bold red"}
 
 
 def summary(run: TurntableRun, error: TruthError | None) -> dict[str, Any]:
@@ -60,53 +61,46 @@ def sigma_rows(run: TurntableRun) -> list[tuple[float, float, float]]:
     return rows
 
 
-def print_summary(console: Console, run: TurntableRun, error: TruthError | None, output: Path) -> None:
-    """The result for a person: deviations, standard deviations, error against a known truth, verdict with reasons."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    console.print(f"{len(run.samples)} of {len(run.session.places)} places used, method {run.method}")
-    table = Table(box=SIMPLE_HEAD, title="Deviation of the motion from its samples (Table 1)", title_justify="left")
-    for column in ("", "mean", "largest"):
-        table.add_column(column, justify="right" if column else "left")
-    for name, deviation, digits in (
-        ("LiDAR's centre / mm", run.deviation.centre_mm, 2),
-        ("z axis / deg", run.deviation.z_deg, 3),
-        ("x axis / deg", run.deviation.x_deg, 3),
-    ):
-        table.add_row(name, f"{deviation.mean:.{digits}f}", f"{deviation.largest:.{digits}f}")
-    console.print(table)
+def print_summary(console: Console, run: TurntableRun, error: TruthError | None, written: Sequence[Path]) -> None:
+    """The result for a person: the verdict with its reasons and what to do, then the figures."""
+    print_verdict(console, turntable_verdict(run))
     _print_sigmas(console, run)
+    rows = [
+        (name, f"{deviation.mean:.{digits}f}", f"{deviation.largest:.{digits}f}")
+        for name, deviation, digits in (
+            ("LiDAR's centre / mm", run.deviation.centre_mm, 2),
+            ("z axis / deg", run.deviation.z_deg, 3),
+            ("x axis / deg", run.deviation.x_deg, 3),
+        )
+    ]
+    console.print(figures_table("Deviation from the single places (the paper's Table 1)", ("mean", "largest"), rows))
     if error is not None:
         _print_truth(console, error)
-    quality = run.calibration.quality
-    if quality is not None:
-        console.print(f"verdict: [{_COLOURS[quality.verdict]}]{quality.verdict}[/]")
-        for reason in quality.reasons:
-            console.print(f"  - {reason}", markup=False)
-    for note in run.notes:
-        console.print(f"note: {note}", markup=False)
-    console.print(f"written: {output / 'calibration.json'}", markup=False, soft_wrap=True)
+    console.print(f"{len(run.samples)} of {len(run.session.places)} places used, method {run.method}")
+    for file in written:
+        console.print(f"written: {file}", markup=False, soft_wrap=True)
 
 
 def _print_sigmas(console: Console, run: TurntableRun) -> None:
-    rows = sigma_rows(run)
-    for (angle, centre, rotation), where in zip(
-        rows, ("start", "middle", "end of the arc", "a quarter turn on", "half a turn on"), strict=False
-    ):
-        console.print(f"sigma at {angle:8.2f} deg: {centre:7.3f} mm {rotation:8.4f} deg   ({where})")
+    where = ("start of the arc", "its middle", "its end", "a quarter turn on", "half a turn on")
+    rows = [
+        (name, f"{angle:.2f}", f"{centre:.3f}", f"{rotation:.4f}")
+        for name, (angle, centre, rotation) in zip(where, sigma_rows(run), strict=False)
+    ]
+    if rows:
+        console.print(figures_table("Standard deviations", ("reading / deg", "centre / mm", "rotation / deg"), rows))
 
 
 def _print_truth(console: Console, error: TruthError) -> None:
-    for name, centre, rotation in (
-        ("over the arc", error.arc_centre_mm, error.arc_rotation_deg),
-        ("over the turn", error.turn_centre_mm, error.turn_rotation_deg),
-    ):
-        console.print(
-            f"error against truth {name}: mean {centre.mean:.3f} mm {rotation.mean:.4f} deg, "
-            f"largest {centre.largest:.3f} mm {rotation.largest:.4f} deg",
-            soft_wrap=True,
+    rows = [
+        (name, f"{c.mean:.3f}", f"{c.largest:.3f}", f"{r.mean:.4f}", f"{r.largest:.4f}")
+        for name, c, r in (
+            ("over the arc", error.arc_centre_mm, error.arc_rotation_deg),
+            ("over the turn", error.turn_centre_mm, error.turn_rotation_deg),
         )
+    ]
+    columns = ("centre / mm", "largest", "rotation / deg", "largest")
+    console.print(figures_table("Error against the truth", columns, rows))
 
 
 def _pair(deviation: Deviation) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -181,6 +182,11 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def title_of(name: str) -> str:
+    """A session's name without the folders above it."""
+    return re.split(r"[/\\\\]", name.rstrip("/\\"))[-1] or name
+
+
 def provenance_block(provenance: Mapping[str, Any]) -> Markup:
     """Everything needed to repeat a run: options and versions in the open, the inputs' hashes folded away."""
     if not provenance:
@@ -208,7 +214,7 @@ def footer(*content: object) -> Markup:
 
 
 def _setting(key: str, value: object) -> Markup:
-    return el("code", f"{key} = {value}")
+    return el("code", f"{key} = {'not given' if value is None else value}")
 
 
 def _words(key: str) -> str:

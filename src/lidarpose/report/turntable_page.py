@@ -20,7 +20,6 @@ from lidarpose.report.page import (
     Tile,
     Tone,
     Verdict,
-    bullets,
     card,
     document,
     folded,
@@ -31,6 +30,7 @@ from lidarpose.report.page import (
     sentence,
     table,
     tiles,
+    title_of,
     verdict_block,
 )
 from lidarpose.report.scene import scene_block
@@ -72,7 +72,7 @@ def turntable_page(
         section("To repeat this run", "Inputs, versions and options.", provenance_block(run.calibration.provenance)),
         footer("Millimetres and degrees throughout; standard deviations are one sigma. This page needs no network."),
     ]
-    return document(run.session.name, "turntable calibration", body, turntable_scene(run))
+    return document(title_of(run.session.name), "turntable calibration", body, turntable_scene(run))
 
 
 def turntable_verdict(run: TurntableRun, numbers: TurnNumbers | None = None) -> Verdict:
@@ -360,5 +360,5 @@ def _against_paper(run: TurntableRun) -> Markup:
     return el(
         "div",
         table(("largest distance", "mm", "°"), rows, numeric=(1, 2)),
-        bullets(["The closed form uses each place by itself; the joint estimate uses all measurements at once."]),
+        el("p", "The closed form takes each place by itself, this answer all measurements at once.", class_="muted"),
     )

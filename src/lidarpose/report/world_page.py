@@ -27,6 +27,7 @@ from lidarpose.report.page import (
     sentence,
     table,
     tiles,
+    title_of,
     verdict_block,
 )
 from lidarpose.report.scene import scene_block
@@ -47,7 +48,7 @@ def world_page(run: WorldRun) -> str:
         section("To repeat this run", "Inputs, versions and options.", provenance_block(run.calibration.provenance)),
         footer("Millimetres and degrees throughout; standard deviations are one sigma. This page needs no network."),
     ]
-    return document(run.session.name, "world calibration", body, figures.world_scene(run))
+    return document(title_of(run.session.name), "world calibration", body, figures.world_scene(run))
 
 
 def world_verdict(run: WorldRun) -> Verdict:
