@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from lidarpose.geometry.se3 import Pose
     from lidarpose.model.calibration import WorldCalibration
     from lidarpose.model.corner_session import CornerSession
+    from lidarpose.model.world_run import WorldRun
 
 WORLD_METHODS = ("joint", "paper", "paper-approx", "ransac", "harris")
 
@@ -85,29 +86,32 @@ def calibrate_world_session(
             tick=lambda: advance(),
         )
     calibration = run.calibration
-    file = output / "calibration.json"
-    write_calibration(file, calibration)
+    written = [output / "calibration.json"]
+    write_calibration(written[0], calibration)
     if report:
-        write_text(output / "report.html", world_page(run))
-    _print_result(calibration, truth_beside(session_folder), file, json)
+        written.append(output / "report.html")
+        write_text(written[1], world_page(run))
+    _print_result(run, truth_beside(session_folder), written, json)
     return calibration
 
 
-def _print_result(calibration: WorldCalibration, truth: Pose | None, file: Path, json: bool) -> None:
+def _print_result(run: WorldRun, truth: Pose | None, written: list[Path], json: bool) -> None:
     from lidarpose.cli.console import out, print_json
+    from lidarpose.report.summary import print_verdict
+    from lidarpose.report.world_page import world_verdict
 
+    calibration = run.calibration
     if json:
         print_json(summary(calibration, truth))
         return
     console = out()
-    for line in summary_lines(calibration):
-        console.print(line)
+    print_verdict(console, world_verdict(run))
+    lines = summary_lines(calibration)
     if truth is not None:
         metres, radians = calibration.T_world_source.distance(truth)
-        console.print(
-            f"error against the truth beside the session: {1e3 * metres:.3f} mm, {radians * 57.29578:.4f} deg"
-        )
-    console.print(f"written to {file}")
+        lines.append(f"error against the truth beside the session: {1e3 * metres:.3f} mm, {radians * 57.29578:.4f} deg")
+    for line in [*lines, *(f"written: {file}" for file in written)]:
+        console.print(line, markup=False, soft_wrap=True)
 
 
 def summary(calibration: WorldCalibration, truth: Pose | None) -> dict[str, Any]:
@@ -149,9 +153,6 @@ def summary_lines(calibration: WorldCalibration) -> list[str]:
         lines.append(f"scale: {calibration.scale:.6f}")
     if "range_sigma_mm" in figures:
         lines.append(f"range noise found: {figures['range_sigma_mm']:.2f} mm")
-    if quality:
-        lines.append(f"verdict: {quality.verdict}")
-        lines += [f"  - {reason}" for reason in quality.reasons]
     return lines
 
 
