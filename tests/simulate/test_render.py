@@ -226,20 +226,18 @@ def test_several_sweeps_share_beams_but_not_noise(rig: TurntableRig) -> None:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_nothing_hides_the_board(family: Family) -> None:
-    for seed in (0, 1):
-        rig = draw_rig(seed, family=family)
-        scene = draw_scene(rig, "", seed)
-        for k, panel in enumerate(rig.panels):
-            corners = rig.T_camera_panel[""][k] @ panel.corners_panel()
-            assert np.all(scene.cast(np.zeros(3), corners).surface == k)
-            for place in (0, len(rig) // 2, len(rig) - 1):
-                ends = rig.chord(place, k)
-                if ends is None:
-                    continue
-                share = np.linspace(0.02, 0.98, 40)[:, None]
-                on_line = rig.T_camera_panel[""][k] @ ((1 - share) * ends[0] + share * ends[1])
-                origin = rig.T_camera_lidar(place).translation
-                assert np.all(scene.cast(origin, on_line - origin).surface == k)
+    rig = draw_rig(0, family=family)
+    scene = draw_scene(rig, "", 0)
+    for k, panel in enumerate(rig.panels):
+        corners = rig.T_camera_panel[""][k] @ panel.corners_panel()
+        assert np.all(scene.cast(np.zeros(3), corners).surface == k)
+        for place in (0, len(rig) // 2, len(rig) - 1):
+            ends = rig.chord(place, k)
+            assert ends is not None
+            share = np.linspace(0.02, 0.98, 40)[:, None]
+            on_line = rig.T_camera_panel[""][k] @ ((1 - share) * ends[0] + share * ends[1])
+            origin = rig.T_camera_lidar(place).translation
+            assert np.all(scene.cast(origin, on_line - origin).surface == k)
 
 
 def test_saturation_ambient_light_and_lit_stripes() -> None:

@@ -162,3 +162,15 @@ def test_the_command_refuses_what_makes_no_sense(tmp_path: Path, capsys: pytest.
         assert run(["simulate", "turntable", out, *SMALL, *wrong]) == 2
         assert capsys.readouterr().err.startswith("lidarpose: ")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_command_says_so_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(scan: object) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lidarpose.storage.session_writer.scan_text", interrupt)
+    assert run(["simulate", "turntable", str(tmp_path / "s"), "--places", "3", *SMALL]) == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

@@ -55,6 +55,8 @@ def build_app() -> App:
     app = App(
         name="lidarpose",
         version=__version__,
+        # `run` has its own message for an interrupted command.
+        suppress_keyboard_interrupt=False,
         help="Find where a LiDAR is, how sure that is, and turn what it sees into metric 3D.",
         help_epilogue=(
             "Exit status: 0 done; 1 the data do not determine what was asked; 2 wrong usage or unreadable input."
