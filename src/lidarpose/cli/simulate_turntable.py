@@ -101,6 +101,7 @@ def simulate_turntable(
     from lidarpose.simulate.rig import draw_rig
     from lidarpose.simulate.session import SimulationOptions, draw_photography, simulate_session
     from lidarpose.storage.session_writer import count_files, write_turntable_session
+    from lidarpose.storage.truth import truth_path
 
     rig = draw_rig(
         seed,
@@ -127,14 +128,16 @@ def simulate_turntable(
     if json:
         print_json(_summary(out, simulated.truth))
     elif not quiet:
-        text = f"{out}: {len(rig)} places, family {family}, seed {seed}; truth in {out}.truth.json"
+        text = f"{out}: {len(rig)} places, family {family}, seed {seed}; truth in {truth_path(out)}"
         console().print(text, soft_wrap=True, markup=False)
 
 
 def _summary(out: Path, truth: dict[str, Any]) -> dict[str, Any]:
+    from lidarpose.storage.truth import truth_path
+
     return {
         "session": str(out),
-        "truth": f"{out}.truth.json",
+        "truth": str(truth_path(out)),
         "family": truth["family"],
         "seed": truth["seed"],
         "places": len(truth["places"]),

@@ -17,10 +17,9 @@ from lidarpose.model.scan import Scan
 from lidarpose.model.session import DEFAULT_PLACEMENT, TurntablePlace, TurntableSession
 from lidarpose.storage.atomic import replacing_folder, restore_folder, write_text
 from lidarpose.storage.camera_info import write_camera_info
+from lidarpose.storage.session import SESSION_FORMAT
 from lidarpose.storage.session_folder import check_free
 from lidarpose.storage.truth import truth_path
-
-SESSION_FORMAT = "lidarpose/turntable-session@1"
 
 Step = Callable[[], None]
 
