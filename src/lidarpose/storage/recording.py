@@ -14,6 +14,7 @@ from lidarpose.model.recording import RealArray, SweepRecording
 from lidarpose.model.scan import LidarSpec
 from lidarpose.storage.atomic import replacing, write_text
 from lidarpose.storage.documents import Schema, check_format, parse, read_toml
+from lidarpose.storage.npy_header import read_npy_header
 from lidarpose.storage.session import LidarSection
 
 FORMAT = "lidarpose/sweep-recording@1"
@@ -118,34 +119,12 @@ def _read_head(path: Path) -> LidarSpec:
 
 
 def _map_array(path: Path, *, required: bool) -> RealArray | None:
-    try:
-        with path.open("rb") as file:
-            version = npy.read_magic(file)
-            read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
-            if read is None:
-                raise InputError(path, f"is an .npy file of version {version}", expected="version 1.0 or 2.0")
-            shape, fortran, dtype = read(file)
-            start = file.tell()
-    except FileNotFoundError as error:
-        if not required:
-            return None
-        raise InputError(path, "is missing", expected="an array of the recording") from error
-    except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror or error}") from error
-    except (ValueError, SyntaxError, TypeError) as error:
-        raise InputError(path, f"is no readable .npy file: {error}") from error
+    if not path.exists() and not required:
+        return None
+    shape, fortran, dtype, start = read_npy_header(path)
     if dtype.kind not in "fiu":
         raise InputError(path, f"holds {dtype}", expected="real numbers (float32, float64 or integers)")
-    wanted = start + int(dtype.itemsize) * _product(shape)
-    found = path.stat().st_size
-    if found != wanted:
-        raise InputError(
-            path,
-            f"holds {found} bytes, but its header announces shape {shape} of {dtype}",
-            expected=f"{wanted} bytes",
-            remedy="The file was cut short or changed; copy or record it again.",
-        )
-    if wanted == start:
+    if 0 in shape:
         return np.zeros(shape, dtype=dtype)
     return np.memmap(path, dtype=dtype, mode="r", offset=start, shape=shape, order="F" if fortran else "C")
 

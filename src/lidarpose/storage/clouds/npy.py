@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -17,12 +17,12 @@ from numpy.lib import format as npy_format
 from lidarpose.errors import InputError
 from lidarpose.model.cloud import Cloud
 from lidarpose.storage.clouds.columns import Columns, read_rows, write_rows
-from lidarpose.storage.limits import file_size, require_bytes, require_count
+from lidarpose.storage.npy_header import read_npy_header
 
 
 def read(path: Path) -> Cloud:
     """Read a cloud from an NPY file."""
-    shape, dtype, offset = _read_header(path)
+    shape, _, dtype, offset = read_npy_header(path)
     if dtype.names is not None and len(shape) == 1:
         return read_rows(path, offset, dtype, shape[0])
     array = np.load(path, allow_pickle=False)
@@ -33,31 +33,6 @@ def read(path: Path) -> Cloud:
     raise InputError(
         path, f"holds an array {shape} of {dtype}", expected="(N, 3) numbers, or (N,) rows with fields x, y, z"
     )
-
-
-def _read_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
-    """Shape, type and where the data start, after comparing them with the file's size."""
-    with path.open("rb") as file:
-        try:
-            version = npy_format.read_magic(file)
-            reader = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
-            if version not in ((1, 0), (2, 0)):
-                raise ValueError(f"version {version}")
-            shape, _, dtype = reader(file)
-        except (ValueError, TypeError, SyntaxError, KeyError, RecursionError, EOFError) as error:
-            problem = str(error).splitlines()[0] if str(error) else "its header is damaged"
-            raise InputError(path, f"is no NPY file: {problem}", expected="an array saved by numpy.save") from error
-        offset = file.tell()
-    if dtype.hasobject:
-        raise InputError(path, "holds Python objects", expected="an array of numbers")
-    count = 1
-    for extent in shape:
-        count *= require_count(path, "shape", extent)
-    needed = count * dtype.itemsize
-    require_bytes(path, "shape", needed, file_size(path) - offset)
-    if needed != file_size(path) - offset:
-        raise InputError(path, "has more bytes than its array takes", field="shape", expected="one array alone")
-    return tuple(shape), dtype, offset
 
 
 @contextmanager
