@@ -229,17 +229,16 @@ def _measure_blur(albedo: PanelAlbedo, image: GrayImage | FloatArray) -> float:
     if len(values) < 100:
         return 0.8
 
-    def misfit(blur: float) -> float:
-        edge_x, edge_y = (blur * np.linalg.norm(gradient[:, k], axis=-1) for k in (0, 1))
-        return float(
-            np.minimum(np.abs(albedo.light_share(grid[:, 0], grid[:, 1], edge_x, edge_y) - values), 0.5).mean()
-        )
+    per_pixel = [np.linalg.norm(gradient[:, k], axis=-1) for k in (0, 1)]
+
+    def misfit(log_blur: float) -> float:
+        edges = [np.exp(log_blur) * scale for scale in per_pixel]
+        share = albedo.light_share(grid[:, 0], grid[:, 1], edges[0], edges[1])
+        return float(np.minimum(np.abs(share - values), 0.5).mean())
 
     from scipy.optimize import minimize_scalar
 
-    best = minimize_scalar(
-        lambda log_blur: misfit(np.exp(log_blur)), bounds=(np.log(0.2), np.log(6.0)), method="bounded"
-    )
+    best = minimize_scalar(misfit, bounds=(np.log(0.2), np.log(6.0)), method="bounded", options={"xatol": 2e-3})
     return float(np.exp(best.x))
 
 
@@ -253,7 +252,7 @@ def _edge_pixels(albedo: PanelAlbedo, image: GrayImage | FloatArray) -> tuple[Fl
     j, i = np.nonzero(usable[:-1] & usable[1:])
     level = np.column_stack([i - 0.5, j])
     middles = np.concatenate([upright, level]).astype(np.float64)
-    middles = middles[:: max(len(middles) // 200, 1)]
+    middles = middles[:: max(len(middles) // 100, 1)]
     pixels = grid_map.pixels(middles)
     offsets = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)), -1).reshape(-1, 2)
     whole = np.round(pixels).astype(int)[:, None] + offsets

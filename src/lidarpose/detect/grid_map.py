@@ -57,7 +57,7 @@ class GridMap:
         g = _apply_homography(np.linalg.inv(self.homography), p)
         J = self.jacobian(g)
         det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-        for _ in range(4):
+        for _ in range(3):
             error = self.pixels(g) - p
             step_x = (J[..., 1, 1] * error[..., 0] - J[..., 0, 1] * error[..., 1]) / det
             step_y = (J[..., 0, 0] * error[..., 1] - J[..., 1, 0] * error[..., 0]) / det

@@ -32,7 +32,7 @@ _FIRST_HALF = 12
 # A profile whose own centre is worse than this tells nothing.
 _WORST_SIGMA_PX = 0.8
 # How well the squares' edges are known, pixels; twice, because the profiles of a block share the error.
-_EDGE_SIGMA_PX = 2.0 * 0.03
+_EDGE_SIGMA_PX = 2.0 * 0.02
 # Profiles without light keep to the curve by this pull, nothing against a real profile's hundredths.
 _PULL_PX = 1.5
 # Step of the derivative by the edges' shift, pixels.

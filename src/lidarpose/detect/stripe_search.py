@@ -101,8 +101,18 @@ class PanelView:
 
     def grid_and_slopes(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Grid coordinates (N, 2) at pixels (N, 2), and their derivatives (N, 4) as in `slopes`."""
-        u, v = (np.asarray(pixels[:, k] - self.low[k], dtype=np.float32)[None] for k in (0, 1))
-        return interpolate(self.nodes, u, v)[0], interpolate(self.slopes, u, v)[0]
+        # By hand: remap rounds to 1/32 of a node's distance, which is a quarter of a pixel.
+        column, row = ((pixels[:, k] - self.low[k]) / _NODE_STEP for k in (0, 1))
+        height, width = self.nodes.shape[:2]
+        i = np.clip(column.astype(np.intp), 0, width - 2)
+        j = np.clip(row.astype(np.intp), 0, height - 2)
+        x, y = (column - i)[:, None], (row - j)[:, None]
+        found = []
+        for table in (self.nodes, self.slopes):
+            upper = table[j, i] * (1.0 - x) + table[j, i + 1] * x
+            lower = table[j + 1, i] * (1.0 - x) + table[j + 1, i + 1] * x
+            found.append(upper * (1.0 - y) + lower * y)
+        return found[0], found[1]
 
     def with_model(self) -> PanelView:
         """The same with the bright image as squares, levels and blur make it: without what else there is in it.
@@ -142,7 +152,8 @@ def _usable_pixels(albedo: PanelAlbedo, grid: FloatArray) -> BoolArray:
 def _nodes(albedo: PanelAlbedo, low: IntArray, high: IntArray) -> tuple[FloatArray, FloatArray]:
     y, x = np.mgrid[low[1] : high[1] + _NODE_STEP : _NODE_STEP, low[0] : high[0] + _NODE_STEP : _NODE_STEP]
     grid = albedo.grid_map.grid(np.stack([x, y], axis=-1))
-    slopes = np.linalg.inv(albedo.grid_map.jacobian(grid)).reshape(*grid.shape[:2], 4)
+    (a, b), (c, d) = np.moveaxis(albedo.grid_map.jacobian(grid), (-2, -1), (0, 1))
+    slopes = np.stack([d, -b, -c, a], axis=-1) / (a * d - b * c)[..., None]
     return grid.astype(np.float32), slopes.astype(np.float32)
 
 
@@ -153,7 +164,7 @@ def _pixel_centres(shape: tuple[int, ...], factor: int) -> tuple[FloatArray, Flo
 
 
 def interpolate(nodes: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Values (..., channels) of a table of nodes at pixels u, v (...) from its corner; bilinear."""
+    """Values (..., channels) of a table of nodes at pixels u, v (...) from its corner; bilinear, to a quarter pixel."""
     step = np.float32(_NODE_STEP)
     return np.asarray(cv2.remap(nodes, u / step, v / step, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
