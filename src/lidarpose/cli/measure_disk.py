@@ -20,6 +20,7 @@ def measure_disk(
     *,
     hole: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     never_stops: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    report: Path | None = None,
     json: Json = False,
 ) -> None:
     """Measure a disk, or round holes in a plane: diameter without bias, and how sure it is.
@@ -37,14 +38,21 @@ def measure_disk(
         Look for round holes in a plane instead of disks.
     never_stops
         The turntable turned on during the sweeps: interpolate its readings by time_s.npy.
+    report
+        Write a page with the edge, the circle and what the standard deviation is made of to this file (.html).
     """
     from lidarpose.cli.console import print_json
     from lidarpose.cli.measure_input import measurement_view
+    from lidarpose.report.disk_page import disk_page
+    from lidarpose.storage.atomic import write_text
+    from lidarpose.workflows.measured_views import round_view
     from lidarpose.workflows.measuring import measure_disk as measure
 
     view = measurement_view(source, calibration, never_stops)
     found = measure(view, "hole" if hole else "disk")
     remarks = [*view.remarks, *_remarks(found[0])]
+    if report is not None:
+        write_text(report, disk_page(round_view(view, found[0], str(source), remarks)))
     if json:
         others = [_document(m) for m in found[1:]]
         print_json({**_document(found[0]), "frame": view.frame, "others": others, "remarks": remarks})

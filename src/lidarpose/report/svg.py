@@ -61,7 +61,11 @@ class Axis:
         """Round numbers within the limits, no more than about `most`."""
         if self.ticks is not None:
             inside = [t for t in self.ticks if self.low <= t <= self.high]
-            return inside[:: max(1, -(-len(inside) // most))]
+            stride = 1
+            while len(inside) > stride * (most + 1):
+                stride *= 2
+            # Of the thinned ticks zero is one, if it is a tick at all.
+            return inside[(inside.index(0.0) if 0.0 in inside else 0) % stride :: stride]
         return log_ticks(self.low, self.high, most) if self.log else round_ticks(self.low, self.high, most)
 
 
