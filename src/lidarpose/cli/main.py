@@ -31,6 +31,8 @@ _GROUPS: dict[str, tuple[str, dict[str, tuple[str, str]]]] = {
         "Sizes from a sweep recording or a cloud.",
         {
             "disk": ("lidarpose.cli.measure_disk:measure_disk", "A disk's diameter, or round holes in a plane."),
+            "box": ("lidarpose.cli.measure_box:measure_box", "A box's three edge lengths."),
+            "planes": ("lidarpose.cli.measure_planes:measure_planes", "Planes, and their angles to each other."),
         },
     ),
     "simulate": (

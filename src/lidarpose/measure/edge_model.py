@@ -2,29 +2,32 @@
 
 A beam's axis meets the plane of the disk at a signed distance s from the circle, known from the beam's direction alone,
 so the range noise plays no part in it. Its spot has some width w. The share of the spot on the material,
-``F = Phi(-s / w)``, is a half exactly at the edge whatever the width, and that is what makes the diameter free of bias.
+``F = Phi(-s / w)`` for a Gaussian one, is a half exactly at the edge whatever the width, and that is what makes the
+diameter free of bias.
 What the instrument returns tells F:
 
-- a range between material and background, whose place between the two is 1 - F on the average (mixed pixels). The
-  scatter about it, kappa F (1 - F), is a parameter: 0 for instruments that average by energy, 1/3 for ones that return
+- a range between material and background (mixed pixels), whose place between the two is on the average the share of
+  the light that comes from the background: 1 - F where both are as bright, k (1 - F) / (F + k (1 - F)) in general. The
+  brightness k is a parameter: it skews the way from one to the other, which a shift of the edge does not. The scatter
+  about it, kappa F (1 - F), is a parameter too: 0 for instruments that average by energy, 1/3 for ones that return
   anything between, 1 for ones that return either;
 - no return near the edge only (mixed pixels dropped): as likely on either side of it;
 - no return beyond the edge (no background in reach): the edge of what is seen.
 
-Spot width, scatter and dropping are parameters beside centre and radius, and all are integrated out by sampling the
-posterior: without mixed returns the likelihood is a flat box with steep walls (each pair of neighbours brackets the
-edge), which has no smooth maximum, and whose middle and width are what is wanted.
+The kind of spot is chosen by the data; its width, scatter and dropping are parameters beside centre and radius, and all
+are integrated out by sampling the posterior. Without mixed returns the likelihood is a flat box with steep walls (each
+pair of neighbours brackets the edge), which has no smooth maximum, and whose middle and width are what is wanted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import ndtr
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.measure.sampling import WALKERS, LogDensity, anneal, climb, sample, scatter_about
 
 # Spot widths (standard deviations) that the prior allows, metres.
 SMALLEST_SPOT_M, LARGEST_SPOT_M = 4e-5, 1e-2
@@ -32,6 +35,8 @@ _SMALLEST_SCATTER, _LARGEST_SCATTER = 1e-5, 2.0
 _OUTLIERS = 0.01
 # Softness of the edge of what is detected, in distances between beams.
 _SOFTNESS = 0.02
+# The prior of the logarithm of the background's brightness over the material's.
+_CONTRAST_SIGMA = 0.7
 # The prior of the spot: its median as a standard deviation (2 mm across), and its spread as a logarithm.
 _USUAL_SPOT_M, _SPOT_SPREAD = 5e-4, 0.6
 
@@ -136,15 +141,14 @@ class _Sorted:
     light: FloatArray | None
     light_sigma: float
     softness: float
+    straight: bool
 
 
-def _sorted(beams: EdgeBeams, centre: FloatArray, reach: float) -> _Sorted:
+def _sorted(beams: EdgeBeams, stretch: FloatArray, reach: float, straight: bool) -> _Sorted:
     has_return = np.isfinite(beams.depth)
     group = 2 * beams.open.astype(int) + (~has_return).astype(int)
     order = np.argsort(group, kind="stable")
     bounds = np.cumsum(np.bincount(group, minlength=4))
-    # How the spot is drawn out changes so little with the centre that the first estimate is enough.
-    _, stretch = signed_distance(beams, centre, 1.0)
     kept = order[: bounds[0]]
     return _Sorted(
         beams.place[order],
@@ -156,19 +160,25 @@ def _sorted(beams: EdgeBeams, centre: FloatArray, reach: float) -> _Sorted:
         None if beams.light is None else beams.light[order[bounds[1] : bounds[2]]],
         beams.light_sigma,
         _SOFTNESS * reach,
+        straight,
     )
 
 
 def _log_likelihood(x: FloatArray, data: _Sorted, inside: bool, dropout: float) -> FloatArray:
-    """Log-likelihood (k,) of parameters (k, 7): centre x, y, radius, log spot, log scatter, lost, threshold."""
+    """Log-likelihood (k,) of parameters (k, 9), in the order of `_USUAL`."""
     radius, spot = x[:, 2, None], np.exp(x[:, 3, None])
     scatter, lost = np.exp(x[:, 4, None]), x[:, 5, None]
-    s = np.hypot(data.place[:, 0] - x[:, 0, None], data.place[:, 1] - x[:, 1, None]) - radius
-    # Of a spot centred on the edge of a disk less than half is on it, by the sagitta of the arc.
-    u = (s + 0.5 * spot**2 / radius) / (spot * data.stretch)
-    F = ndtr(-u if inside else u)
+    if data.straight:
+        s, sagitta = data.place[:, 0] - x[:, 0, None] - x[:, 1, None] * data.place[:, 1], np.zeros_like(spot)
+    else:
+        s = np.hypot(data.place[:, 0] - x[:, 0, None], data.place[:, 1] - x[:, 1, None]) - radius
+        # Of a spot centred on the edge of a disk less than half is on it, by the sagitta of the arc.
+        sagitta = 0.5 * spot**2 / radius
+    u = (s + sagitta) / (spot * data.stretch)
+    F = _share(-u if inside else u, x[:, 8, None])
     a, b, c = data.ends
-    share = F[:, :a]
+    # Light weighs the two ranges: a background k times as bright as the material pulls the mean its way.
+    share = F[:, :a] / (F[:, :a] + np.exp(x[:, 7, None]) * (1.0 - F[:, :a]))
     mixed = share * (1.0 - share)
     variance = share * data.near_variance + (1.0 - share) * data.far_variance + scatter * mixed
     normal = np.exp(-0.5 * (data.depth - 1.0 + share) ** 2 / variance) / np.sqrt(2.0 * np.pi * variance)
@@ -186,6 +196,16 @@ def _log_likelihood(x: FloatArray, data: _Sorted, inside: bool, dropout: float) 
         if data.light is not None:
             total += _log_light(data.light, F[:, b:c], scatter, data.light_sigma).sum(axis=1)
     return np.asarray(total)
+
+
+def _share(u: FloatArray, evenness: FloatArray) -> FloatArray:
+    """Share (k, n) of a spot on one side of a straight edge, at u standard deviations of the spot inside it.
+
+    Between a Gaussian spot (evenness 0) and a disk of even light (1), whose radius is two standard deviations.
+    """
+    z = np.clip(0.5 * u, -1.0, 1.0)
+    disk = 0.5 + (np.arcsin(z) + z * np.sqrt(1.0 - z * z)) / np.pi
+    return np.asarray((1.0 - evenness) * ndtr(u) + evenness * disk)
 
 
 def _log_light(light: FloatArray, share: FloatArray, scatter: FloatArray, sigma: float) -> FloatArray:
@@ -215,26 +235,46 @@ def fit_edge(
     reach
         How far the first estimate may be off, metres; also about the distance between beams.
     """
+    # How the spot is drawn out changes so little with the centre that the first estimate is enough.
+    _, stretch = signed_distance(beams, centre, 1.0)
 
-    log_posterior = _posterior(beams, centre, radius, inside, dropout, reach)
-    rng = np.random.default_rng(seed)
-    walkers = _anneal(log_posterior, _start(centre, radius, reach, rng), rng)
-    # Beams far from the edge, in widths of the spot, say nothing more.
-    spot = float(np.exp(walkers[:, 3].max()))
-    s, stretch = signed_distance(beams, walkers[:, :2].mean(axis=0), float(walkers[:, 2].mean()))
-    near = beams.at(np.abs(s) < 6.0 * spot * stretch + 1.5 * reach)
-    log_posterior = _posterior(near, centre, radius, inside, dropout, reach)
-    samples = _sample(log_posterior, walkers, rng)
-    mean = samples[:, :3].mean(axis=0)
+    def round_prior(x: FloatArray) -> FloatArray:
+        return np.where(np.abs(x[:, 2] - radius) < 0.5 * radius, 0.0, -np.inf)
+
+    shape = np.array([centre[0], centre[1], radius])
+    problem = _Problem(beams, stretch, reach, False, inside, dropout, round_prior)
+    samples = _explore(problem, shape, np.full(3, 0.3 * reach), seed)
     covariance = np.cov(samples[:, :3].T)
     if not tells_threshold(beams):
-        # Sampling a ridge that the prior alone bounds is slow; its variance is known: that of threshold times spot.
-        covariance[2, 2] += _USUAL_SPOT_M**2 * np.exp(2.0 * _SPOT_SPREAD**2) * float(np.mean(stretch**2))
+        covariance[2, 2] += threshold_variance(stretch)
+    mean = samples[:, :3].mean(axis=0)
     spot, scatter = np.exp(np.median(samples[:, 3:5], axis=0))
     return EdgeFit(mean[:2], float(mean[2]), covariance, float(spot), float(scatter), float(np.median(samples[:, 5])))
 
 
-LogDensity = Callable[[FloatArray], FloatArray]
+# A straight edge may deviate by this from the direction that the planes beside it give it, radians.
+_SLOPE_SIGMA = 0.01
+
+
+def fit_straight_edge(
+    beams: EdgeBeams, offset: float, *, dropout: float, reach: float, seed: int = 0
+) -> tuple[float, float]:
+    """Where a straight edge lies along the first axis of the plane, at zero along the second, and its variance, m^2.
+
+    The material is on the side of smaller first coordinates; the edge runs along the second axis, nearly. Otherwise as
+    `fit_edge`.
+    """
+    stretch = np.sqrt(1.0 + beams.slope[:, 0] ** 2 / (1.0 - (beams.slope**2).sum(axis=-1)))
+
+    def straight_prior(x: FloatArray) -> FloatArray:
+        return np.asarray(-0.5 * (x[:, 1] / _SLOPE_SIGMA) ** 2)
+
+    problem = _Problem(beams, stretch, reach, True, True, dropout, straight_prior)
+    samples = _explore(problem, np.array([offset, 0.0, 0.0]), np.array([0.3 * reach, 0.5 * _SLOPE_SIGMA, 0.0]), seed)
+    variance = float(np.var(samples[:, 0]))
+    if not tells_threshold(beams):
+        variance += threshold_variance(stretch)
+    return float(samples[:, 0].mean()), variance
 
 
 def tells_threshold(beams: EdgeBeams) -> bool:
@@ -242,81 +282,122 @@ def tells_threshold(beams: EdgeBeams) -> bool:
     return bool(np.any(~beams.open)) or beams.light is not None
 
 
-def _posterior(
-    beams: EdgeBeams, centre: FloatArray, radius: float, inside: bool, dropout: float, reach: float
-) -> LogDensity:
-    """Log posterior density (k,) of parameters (k, 7), up to a constant.
+def threshold_variance(stretch: FloatArray) -> float:
+    """Variance of an edge of hits and misses where the prior alone bounds spot and threshold, m^2.
 
-    The prior is even within bounds; for the spot it prefers, weakly, what 2D LiDARs have at a few metres, and for the
-    threshold of detection one half. Both matter only where the data say nothing of them.
+    Sampling such a ridge is slow; its variance is known, that of threshold times spot.
     """
-    data = _sorted(beams, centre, reach)
-    threshold_sigma = 1.0 if tells_threshold(beams) else 1e-3
+    return float(_USUAL_SPOT_M**2 * np.exp(2.0 * _SPOT_SPREAD**2) * np.mean(stretch**2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """An edge to estimate: its beams, how their spots are drawn out, and what shape it has."""
+
+    beams: EdgeBeams
+    stretch: FloatArray
+    reach: float
+    straight: bool
+    inside: bool
+    dropout: float
+    shape_prior: LogDensity
+
+    def near(self, shape: FloatArray, distance: FloatArray) -> _Problem:
+        """The problem with the beams that are nearer to a shape (3,) than `distance` (n,)."""
+        if self.straight:
+            s = self.beams.place[:, 0] - shape[0] - shape[1] * self.beams.place[:, 1]
+        else:
+            s, _ = signed_distance(self.beams, shape[:2], float(shape[2]))
+        close = np.abs(s) < distance
+        return replace(self, beams=self.beams.at(close), stretch=self.stretch[close])
+
+    def active(self) -> BoolArray:
+        """Which of the nine parameters the data can tell; the others stay at their usual values."""
+        beams = self.beams
+        bounded, open_ = bool(np.any(~beams.open)), bool(np.any(beams.open))
+        spot = tells_threshold(beams)
+        lost = bool(np.any(~beams.open & ~np.isfinite(beams.depth)))
+        return np.array([True, True, not self.straight, spot, spot, lost, spot and open_, bounded, False])
+
+
+# Shape (centre x, y, radius; or offset, slope), log spot, log scatter, share of mixed lost, threshold, log contrast,
+# evenness of the spot.
+_USUAL = np.array([0.0, 0.0, 0.0, np.log(_USUAL_SPOT_M), np.log(0.03), 0.0, 0.0, 0.0, 0.5])
+
+
+def _explore(problem: _Problem, shape: FloatArray, off: FloatArray, seed: int) -> FloatArray:
+    """Samples (n, 9) of the posterior, from a first estimate of the shape (3,) that may be `off` (3,)."""
+    rng = np.random.default_rng(seed)
+    active = problem.active()
+    usual = _USUAL.copy()
+    usual[:3] = shape
+    walkers = anneal(_posterior(problem, active, usual), _start(shape, off, problem.reach, rng)[:, active], rng)
+    if active[3]:
+        walkers, usual = _best_spot(problem, walkers, active, usual, rng)
+    # Beams far from the edge, in widths of the spot, say nothing more.
+    full = _completed(walkers, active, usual)
+    width = 6.0 * float(np.exp(full[:, 3].max())) * problem.stretch + 1.5 * problem.reach
+    near = problem.near(full[:, :3].mean(axis=0), width)
+    return _completed(sample(_posterior(near, active, usual), walkers, rng), active, usual)
+
+
+def _best_spot(
+    problem: _Problem, walkers: FloatArray, active: BoolArray, usual: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Walkers for the kind of spot that explains the beams best, and the usual parameters with its evenness."""
+    best = -np.inf
+    chosen, kind = walkers, usual
+    for evenness in (0.0, 0.5, 1.0):
+        trial = usual.copy()
+        trial[8] = evenness
+        density = _posterior(problem, active, trial)
+        top, value, covariance = climb(density, walkers)
+        if value > best:
+            best, kind = value, trial
+            chosen = scatter_about(density, top, value, covariance, walkers, rng)
+    return chosen, kind
+
+
+def _completed(x: FloatArray, active: BoolArray, usual: FloatArray) -> FloatArray:
+    """Parameters (k, 9) from the active ones (k, d)."""
+    full = np.repeat(usual[None], len(x), axis=0)
+    full[:, active] = x
+    return full
+
+
+def _posterior(problem: _Problem, active: BoolArray, usual: FloatArray) -> LogDensity:
+    """Log posterior density (k,) of the active parameters (k, d), up to a constant.
+
+    The prior is even within bounds; for the spot it prefers, weakly, what 2D LiDARs have at a few metres, for the
+    threshold of detection one half, and for both sides of the edge the same brightness. All three matter only where
+    the data say nothing of them.
+    """
+    data = _sorted(problem.beams, problem.stretch, problem.reach, problem.straight)
     low = np.log([SMALLEST_SPOT_M, _SMALLEST_SCATTER])
     high = np.log([LARGEST_SPOT_M, _LARGEST_SCATTER])
 
-    def density(x: FloatArray) -> FloatArray:
-        ok = ((x[:, 3:5] > low) & (x[:, 3:5] < high)).all(axis=1) & (x[:, 5] >= 0.0) & (x[:, 5] <= 1.0)
-        ok &= np.abs(x[:, 2] - radius) < 0.5 * radius
+    def density(some: FloatArray) -> FloatArray:
+        x = _completed(some, active, usual)
+        ok = ((x[:, 3:5] > low) & (x[:, 3:5] < high)).all(axis=1)
+        ok &= ((x[:, [5, 8]] >= 0.0) & (x[:, [5, 8]] <= 1.0)).all(axis=1)
+        shape = problem.shape_prior(x)
+        ok &= np.isfinite(shape)
         value = np.full(len(x), -np.inf)
         if ok.any():
             prior = -0.5 * ((x[ok, 3] - np.log(_USUAL_SPOT_M)) / _SPOT_SPREAD) ** 2
-            prior -= 0.5 * (x[ok, 6] / threshold_sigma) ** 2
-            value[ok] = _log_likelihood(x[ok], data, inside, dropout) + prior
+            prior -= 0.5 * x[ok, 6] ** 2 + 0.5 * (x[ok, 7] / _CONTRAST_SIGMA) ** 2
+            value[ok] = _log_likelihood(x[ok], data, problem.inside, problem.dropout) + prior + shape[ok]
         return value
 
     return density
 
 
-_WALKERS = 32
-_TEMPERATURES = np.geomspace(60.0, 1.0, 90)
-_SETTLE = 40
-_STEPS = 200
-
-
-def _start(centre: FloatArray, radius: float, reach: float, rng: np.random.Generator) -> FloatArray:
-    """Walkers (k, 7) spread over what the first estimate leaves open."""
-    middle = np.array([centre[0], centre[1], radius, np.log(0.4 * reach), np.log(0.03), 0.3, 0.0])
-    spread = np.array([0.3 * reach, 0.3 * reach, 0.3 * reach, 0.5, 1.5, 0.15, 0.5])
-    walkers = middle + spread * rng.normal(size=(_WALKERS, 7))
-    walkers[:, 5] = np.clip(walkers[:, 5], 0.01, 0.99)
+def _start(shape: FloatArray, off: FloatArray, reach: float, rng: np.random.Generator) -> FloatArray:
+    """Walkers (k, 9) spread by `off` (3,) about a first estimate of the shape (3,), and over all else."""
+    middle = np.concatenate([shape, [np.log(0.4 * reach), np.log(0.03), 0.3, 0.0, 0.0, 0.5]])
+    spread = np.concatenate([off, [0.5, 1.5, 0.15, 0.5, 0.3, 0.2]])
+    walkers = middle + spread * rng.normal(size=(WALKERS, 9))
+    walkers[:, [5, 8]] = np.clip(walkers[:, [5, 8]], 0.01, 0.99)
     walkers[:, 3] = np.clip(walkers[:, 3], np.log(1.2 * SMALLEST_SPOT_M), np.log(0.8 * LARGEST_SPOT_M))
     walkers[:, 4] = np.clip(walkers[:, 4], np.log(2.0 * _SMALLEST_SCATTER), np.log(0.8 * _LARGEST_SCATTER))
     return walkers
-
-
-def _anneal(log_density: LogDensity, walkers: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Walkers cooled down from a flattened posterior, so that none stays behind in a side valley."""
-    value = log_density(walkers)
-    for temperature in _TEMPERATURES:
-        walkers, value = _stretch(log_density, walkers, value, float(temperature), rng)
-    return walkers
-
-
-def _sample(log_density: LogDensity, walkers: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Samples (n, 7) of the posterior."""
-    value = log_density(walkers)
-    kept = []
-    for step in range(_SETTLE + _STEPS):
-        walkers, value = _stretch(log_density, walkers, value, 1.0, rng)
-        if step >= _SETTLE:
-            kept.append(walkers.copy())
-    return np.concatenate(kept)
-
-
-def _stretch(
-    log_density: LogDensity, walkers: FloatArray, value: FloatArray, temperature: float, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """One stretch move of all walkers (Goodman and Weare, 2010), which knows no scales to tune."""
-    k, d = walkers.shape
-    walkers, value = walkers.copy(), value.copy()
-    halves = np.array_split(rng.permutation(k), 2)
-    for mine, others in (halves, halves[::-1]):
-        partner = walkers[others[rng.integers(0, len(others), len(mine))]]
-        z = (1.0 + rng.uniform(size=len(mine))) ** 2 / 2.0
-        trial = partner + z[:, None] * (walkers[mine] - partner)
-        trial_value = log_density(trial)
-        gain = np.where(np.isneginf(trial_value), -np.inf, trial_value - value[mine])
-        accept = np.log(rng.uniform(size=len(mine))) < (d - 1) * np.log(z) + gain / temperature
-        walkers[mine[accept]], value[mine[accept]] = trial[accept], trial_value[accept]
-    return walkers, value

@@ -7,13 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.measure.assemble import readings_between
 from lidarpose.measure.beams import Beams, beams_of, chosen_beams, range_noise
+from lidarpose.measure.box import BoxMeasurement
+from lidarpose.measure.box import measure_box as measure_box_of
 from lidarpose.measure.cloud_beams import beams_of_cells, beams_of_rings, recording_from_cloud
 from lidarpose.measure.disk import RoundMeasurement, measure_round, with_calibration
 from lidarpose.measure.outline import Kind, nothing_round
+from lidarpose.measure.planes import MeasuredPlane, joined_planes
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.recording import SweepRecording
@@ -118,6 +122,41 @@ def measure_disk(view: MeasuringView, kind: Kind = "disk", *, seed: int = 0) -> 
     if view.covariance is None or view.moved is None:
         return found
     return [with_calibration(m, view.moved, view.covariance) for m in found]
+
+
+def measure_box(view: MeasuringView, *, seed: int = 0) -> BoxMeasurement:
+    """The box that stands out most: its three edge lengths.
+
+    Raises
+    ------
+    UndeterminedError
+        If no box is found, or an end of an edge is not seen.
+    """
+    return measure_box_of(view.beams, view.noise_m, seed=seed)
+
+
+def measure_planes(view: MeasuringView, *, least_share: float = 0.002, seed: int = 0) -> list[MeasuredPlane]:
+    """The flat patches of a view, those of one plane joined, largest first.
+
+    Parameters
+    ----------
+    least_share
+        Patches with a smaller share of all points are left out.
+
+    Raises
+    ------
+    UndeterminedError
+        If nothing flat is found.
+    """
+    points = view.beams.points.reshape(-1, 3)
+    points = points[np.isfinite(points[:, 0])]
+    patches = segment_planes(points, PlaneSearch(min_points=60, min_share=least_share, seed=seed))
+    planes = joined_planes([points[p.indices] for p in patches], view.noise_m)
+    if not planes:
+        raise UndeterminedError(
+            "Nothing flat was found", remedy="A plane must hold at least 60 points and a five hundredth of all."
+        )
+    return planes
 
 
 def with_readings_between(recording: SweepRecording) -> SweepRecording:

@@ -1,0 +1,78 @@
+"""`lidarpose measure planes`: planes and their angles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter, validators
+
+from lidarpose.cli.options import Json
+
+if TYPE_CHECKING:
+    from lidarpose.measure.planes import MeasuredPlane
+
+
+def measure_planes(
+    source: Path,
+    calibration: Path | None = None,
+    /,
+    *,
+    least_share: Annotated[float, Parameter(validator=validators.Number(gt=0.0, lt=1.0))] = 0.002,
+    never_stops: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    json: Json = False,
+) -> None:
+    """Find planes, and measure their angles to each other and to the frame's axes.
+
+    Parameters
+    ----------
+    source
+        Folder of a sweep recording, or a cloud.
+    calibration
+        The turntable's calibration file, for a recording.
+    least_share
+        Leave out planes with less than this share of the points.
+    never_stops
+        The turntable turned on during the sweeps: interpolate its readings by time_s.npy.
+    """
+    from lidarpose.cli.console import print_json
+    from lidarpose.cli.measure_input import measurement_view
+    from lidarpose.measure.planes import axis_angles_deg, plane_angles_deg
+    from lidarpose.workflows.measuring import measure_planes as measure
+
+    view = measurement_view(source, calibration, never_stops)
+    planes = measure(view, least_share=least_share)
+    if not json:
+        _print(planes, view.frame)
+        return
+    entries = [
+        {
+            "normal": p.plane.normal.tolist(),
+            "offset_m": p.plane.offset,
+            "points": p.points,
+            "rms_mm": 1e3 * p.rms_m,
+            "normal_sigma_deg": p.normal_sigma_rad * 57.29577951308232,
+            "axis_angles_deg": axis_angles_deg(p.plane).tolist(),
+        }
+        for p in planes
+    ]
+    print_json({"planes": entries, "angles_deg": plane_angles_deg(planes).tolist(), "frame": view.frame})
+
+
+def _print(planes: list[MeasuredPlane], frame: str) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from lidarpose.cli.console import out
+    from lidarpose.measure.planes import axis_angles_deg, plane_angles_deg
+
+    angles = plane_angles_deg(planes)
+    table = Table(box=SIMPLE_HEAD, title=f"Planes, normal . x = offset in the {frame} frame", title_justify="left")
+    for column in ("", "normal", "offset m", "points", "rms mm", "to x, y, z deg", "to the others deg"):
+        table.add_column(column, justify="right")
+    for k, p in enumerate(planes):
+        normal = " ".join(f"{x:+.4f}" for x in p.plane.normal)
+        axes = " ".join(f"{a:.1f}" for a in axis_angles_deg(p.plane))
+        others = " ".join("-" if k == j else f"{a:.2f}" for j, a in enumerate(angles[k]))
+        table.add_row(str(k), normal, f"{p.plane.offset:.4f}", str(p.points), f"{1e3 * p.rms_m:.2f}", axes, others)
+    out().print(table)

@@ -1,0 +1,243 @@
+"""Boxes: edge lengths from the planes of the faces where two bound an edge, from the faces' own borders elsewhere.
+
+One view shows at most three faces of a box. Each edge then ends at a visible face on one side; on the other it ends at
+the border of the faces along it, estimated by the same model of the beam at the edge as a disk's, or at a plane that
+the box stands on or leans against.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy import ndimage
+
+from lidarpose.errors import UndeterminedError
+from lidarpose.geometry.arrays import BoolArray, FloatArray, unit
+from lidarpose.measure.beams import Beams
+from lidarpose.measure.edge_beams import WIDEST_SPOT_M, PlaneView, edge_beams, view_of_patch
+from lidarpose.measure.edge_model import fit_straight_edge
+from lidarpose.measure.outline import in_plane
+from lidarpose.measure.patches import Patch, find_patches
+
+# Faces of a box stand at right angles to within this; edges' directions come from the faces, so that no more is needed.
+_SQUARE_RAD = np.deg2rad(4.0)
+_LARGEST_FACE_M = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class BoxEdge:
+    """One of the three lengths of a box.
+
+    Attributes
+    ----------
+    length_m, sigma_m
+        The length and its standard deviation (without the calibration's share).
+    direction : (3,)
+        Along the edge, outward at its end nearer to a visible face.
+    by
+        What bounds it at both ends: "face", "border" or "support" (the plane it stands on).
+    """
+
+    length_m: float
+    sigma_m: float
+    direction: FloatArray
+    by: tuple[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class BoxMeasurement:
+    """A measured box, in the beams' frame: its edges, longest first, and the faces that were seen.
+
+    `face_normals` (k, 3) point out of the box; `face_points` (k,) is how many points each has; `angles_deg` are the
+    angles between neighbouring faces.
+    """
+
+    edges: tuple[BoxEdge, ...]
+    face_normals: FloatArray
+    face_points: tuple[int, ...]
+    angles_deg: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Face:
+    """A face with its beams; the normal points out of the box, which is towards the LiDAR."""
+
+    patch: Patch
+    view: PlaneView
+    normal: FloatArray
+    offset: float
+    middle: FloatArray
+    places: FloatArray
+
+
+@dataclass(frozen=True)
+class _End:
+    """Where the box ends in a direction: the offset along it, its variance in m^2, and what tells it."""
+
+    position: float
+    variance: float
+    by: str
+
+
+def measure_box(beams: Beams, sigma: float, *, seed: int = 0) -> BoxMeasurement:
+    """The box in a grid of beams (N, M): of all corners and edges of flat faces the one with most points.
+
+    Raises
+    ------
+    UndeterminedError
+        If no two faces meet at a right angle, pointing outward, or an end of an edge is not seen.
+    """
+    faces = [f for p in find_patches(beams.points, sigma) if (f := _face(beams, p, sigma)) is not None]
+    chosen = _box_faces(faces, sigma)
+    others = [f for f in faces if f not in chosen]
+    axes = [f.normal for f in chosen]
+    if len(axes) == 2:
+        axes.append(unit(np.cross(axes[0], axes[1])))
+    edges = [_edge(axis, chosen, others, sigma, seed) for axis in axes]
+    edges.sort(key=lambda e: -e.length_m)
+    angles = [float(np.rad2deg(np.arccos(np.clip(a.normal @ b.normal, -1.0, 1.0)))) for a, b in combinations(chosen, 2)]
+    normals = np.stack([f.normal for f in chosen])
+    return BoxMeasurement(tuple(edges), normals, tuple(f.patch.count for f in chosen), tuple(angles))
+
+
+def _face(beams: Beams, patch: Patch, sigma: float) -> _Face | None:
+    inner = ndimage.binary_erosion(patch.mask, iterations=2, border_value=0)
+    if np.count_nonzero(inner) < 30:
+        return None
+    try:
+        view = view_of_patch(beams, patch, inner, sigma)
+    except (ValueError, np.linalg.LinAlgError):
+        return None
+    direction = view.beams.direction[view.plane_used]
+    normal, offset = view.plane.normal, view.plane.offset
+    toward = float(np.median(direction @ normal))
+    if abs(toward) < np.sin(np.deg2rad(6.0)):
+        return None
+    if toward > 0.0:
+        normal, offset = -normal, -offset
+    places = view.place[view.on]
+    middle = view.frame[0] + np.median(places, axis=0) @ view.frame[1:]
+    return _Face(patch, view, normal, offset, middle, places)
+
+
+def _box_faces(faces: list[_Face], sigma: float) -> list[_Face]:
+    """Three faces that meet pairwise, or two, with most points."""
+    small = [f for f in faces if float(np.ptp(f.places, axis=0).max()) < _LARGEST_FACE_M]
+    pairs = {(a, b) for a, b in combinations(range(len(small)), 2) if _are_neighbours(small[a], small[b], sigma)}
+    triples = [t for t in combinations(range(len(small)), 3) if all(p in pairs for p in combinations(t, 2))]
+    groups: list[tuple[int, ...]] = [*triples] or [*sorted(pairs)]
+    if not groups:
+        raise UndeterminedError(
+            "No two flat faces that meet at a right angle, pointing outward, were found",
+            remedy="Turn the box so that two or three of its faces are seen at more than ten degrees, with at least "
+            "eight sweeps and eight beams on each.",
+        )
+    best = max(groups, key=lambda group: sum(small[k].patch.count for k in group))
+    return [small[k] for k in best]
+
+
+def _are_neighbours(a: _Face, b: _Face, sigma: float) -> bool:
+    """True if two faces stand at a right angle, point away from each other, and touch along their common edge."""
+    if abs(float(a.normal @ b.normal)) > np.sin(_SQUARE_RAD):
+        return False
+    if float(b.normal @ a.middle) > b.offset or float(a.normal @ b.middle) > a.offset:
+        return False
+    along = unit(np.cross(a.normal, b.normal))
+    spans = []
+    for one, other in ((a, b), (b, a)):
+        points = one.view.frame[0] + one.places @ one.view.frame[1:]
+        gap = other.offset - points @ other.normal
+        near = np.abs(gap) < 4.0 * one.view.step + WIDEST_SPOT_M + 5.0 * sigma
+        if np.count_nonzero(near) < 4:
+            return False
+        spans.append(np.percentile(points[near] @ along, [5.0, 95.0]))
+    overlap = min(spans[0][1], spans[1][1]) - max(spans[0][0], spans[1][0])
+    return bool(overlap > 0.5 * min(spans[0][1] - spans[0][0], spans[1][1] - spans[1][0]))
+
+
+def _edge(axis: FloatArray, faces: list[_Face], others: list[_Face], sigma: float, seed: int) -> BoxEdge:
+    ends = [_end(sign * axis, faces, others, sigma, seed) for sign in (1.0, -1.0)]
+    length = ends[0].position + ends[1].position
+    return BoxEdge(length, float(np.sqrt(ends[0].variance + ends[1].variance)), axis, (ends[0].by, ends[1].by))
+
+
+def _end(direction: FloatArray, faces: list[_Face], others: list[_Face], sigma: float, seed: int) -> _End:
+    """Where the box ends in a direction."""
+    along = [f for f in faces if abs(float(f.normal @ direction)) < 0.5]
+    for face in faces:
+        if float(face.normal @ direction) > 0.9:
+            # The plane, taken where the other faces are.
+            return _End(face.offset, _plane_variance(face, np.mean([f.middle for f in along], axis=0)), "face")
+    borders = [b for f in along if (b := _border(f, direction, sigma, seed)) is not None]
+    if borders:
+        weights = np.array([1.0 / b.variance for b in borders])
+        position = float(weights @ [b.position for b in borders] / weights.sum())
+        chi2 = sum((b.position - position) ** 2 / b.variance for b in borders)
+        # Two borders that disagree are both worse than they say.
+        return _End(position, max(1.0, chi2 / max(1, len(borders) - 1)) / float(weights.sum()), "border")
+    support = _support(direction, along, others)
+    if support is not None:
+        return support
+    raise UndeterminedError(
+        "One end of the box is not seen: neither a face, nor a free border, nor a plane that it stands on",
+        remedy="Leave its borders free against a background that is farther away, or record it from another side.",
+    )
+
+
+def _border(face: _Face, direction: FloatArray, sigma: float, seed: int) -> _End | None:
+    """Where a face ends in a direction, by the beams that cross its border there; None if that is not free."""
+    e = direction - float(direction @ face.normal) * face.normal
+    e = unit(e)
+    across = np.cross(face.normal, e)
+    frame = np.stack([face.middle, e, across])
+    place = in_plane(face.view.frame[0] + face.view.place @ face.view.frame[1:], face.view.plane, frame)
+    on = place[face.view.on]
+    last = float(np.percentile(on[:, 0], 99.5))
+    size = 0.5 * float(np.ptp(on[:, 0]))
+    near_border = on[on[:, 0] > last - 6.0 * face.view.step]
+    low, high = np.percentile(near_border[:, 1], [2.0, 98.0])
+    guard = 2.0 * face.view.step + WIDEST_SPOT_M
+    middle = 0.5 * (low + high)
+    allowed: BoolArray = (place[:, 1] > low + guard) & (place[:, 1] < high - guard)
+    placed = np.column_stack([place[:, 0], place[:, 1] - middle])
+    view = PlaneView(**{**face.view.__dict__, "place": placed, "frame": frame})
+    chosen = edge_beams(view, place[:, 0] - last, size, sigma, allowed)
+    if chosen is None:
+        return None
+    near, edge, dropout = chosen
+    covered = float(np.ptp(edge.place[:, 1])) if len(edge) else 0.0
+    if covered < 0.3 * (high - low) or covered < 6.0 * face.view.step:
+        return None
+    offset, variance = fit_straight_edge(edge, last, dropout=dropout, reach=face.view.step, seed=seed)
+    border = face.middle + offset * e + middle * across
+    # A plane that is off by a little moves the border of a face seen aslant along it.
+    sight = face.view.beams.direction[near].mean(axis=0)
+    slant = float(sight @ e) / float(sight @ face.normal)
+    return _End(float(border @ direction), variance + slant**2 * _plane_variance(face, border), "border")
+
+
+def _support(direction: FloatArray, along: list[_Face], others: list[_Face]) -> _End | None:
+    """A plane across the direction that the faces end at: a floor or a wall."""
+    best: tuple[float, _End] | None = None
+    for face in along:
+        points = face.view.frame[0] + face.places @ face.view.frame[1:]
+        last = float(np.percentile(points @ direction, 99.5))
+        for other in others:
+            if float(other.normal @ direction) > -np.cos(_SQUARE_RAD):
+                continue
+            position = float(face.middle @ direction) + (other.offset - float(other.normal @ face.middle)) / float(
+                other.normal @ direction
+            )
+            gap = abs(position - last)
+            if gap < 4.0 * face.view.step + 0.01 and (best is None or gap < best[0]):
+                best = gap, _End(position, _plane_variance(other, face.middle), "support")
+    return None if best is None else best[1]
+
+
+def _plane_variance(face: _Face, point: FloatArray) -> float:
+    """Variance of the distance of a face's plane from a point near it, m^2."""
+    local = (point - face.view.frame[0]) @ face.view.frame[1:].T
+    J = np.array([local[0], local[1], 1.0])
+    return float(J @ face.view.plane_covariance @ J)

@@ -1,0 +1,138 @@
+"""Means and covariances of a posterior by sampling: for likelihoods that may be flat with steep walls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from lidarpose.geometry.arrays import FloatArray
+
+LogDensity = Callable[[FloatArray], FloatArray]
+"""Log-density (k,), up to a constant, of points (k, d); -inf outside its bounds."""
+
+WALKERS = 32
+_TEMPERATURES = np.geomspace(60.0, 1.0, 70)
+_SETTLE = 60
+_STEPS = 200
+
+
+def anneal(log_density: LogDensity, walkers: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Walkers (k, d) cooled down from a flattened density, so that none stays behind in a side valley."""
+    value = log_density(walkers)
+    for temperature in _TEMPERATURES:
+        walkers, value = _stretch(log_density, walkers, value, float(temperature), rng)
+    return walkers
+
+
+def sample(log_density: LogDensity, walkers: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Samples (n, d) of a density, from walkers (k, d) that are about where it is high."""
+    value = log_density(walkers)
+    kept = []
+    for step in range(_SETTLE + _STEPS):
+        walkers, value = _stretch(log_density, walkers, value, 1.0, rng)
+        if step >= _SETTLE:
+            kept.append(walkers.copy())
+    return np.concatenate(kept)
+
+
+def _stretch(
+    log_density: LogDensity, walkers: FloatArray, value: FloatArray, temperature: float, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """One stretch move of all walkers (Goodman and Weare, 2010), which knows no scales to tune."""
+    k, d = walkers.shape
+    walkers, value = walkers.copy(), value.copy()
+    halves = np.array_split(rng.permutation(k), 2)
+    for mine, others in (halves, halves[::-1]):
+        partner = walkers[others[rng.integers(0, len(others), len(mine))]]
+        z = (1.0 + rng.uniform(size=len(mine))) ** 2 / 2.0
+        trial = partner + z[:, None] * (walkers[mine] - partner)
+        trial_value = log_density(trial)
+        gain = np.where(np.isneginf(trial_value), -np.inf, trial_value - value[mine])
+        accept = np.log(rng.uniform(size=len(mine))) < (d - 1) * np.log(z) + gain / temperature
+        walkers[mine[accept]], value[mine[accept]] = trial[accept], trial_value[accept]
+    return walkers, value
+
+
+def climb(log_density: LogDensity, walkers: FloatArray) -> tuple[FloatArray, float, FloatArray | None]:
+    """The top (d,) of a density by Newton's method from the best walker, its value, and the covariance there (d, d).
+
+    The covariance is None where the density has no smooth top.
+    """
+    value = log_density(walkers)
+    top, best = walkers[int(np.argmax(value))], float(np.max(value))
+    scale = np.maximum(walkers.std(axis=0), 1e-12)
+    covariance = None
+    for _ in range(20):
+        gradient, hessian = _derivatives(log_density, top, 0.1 * scale)
+        if not (np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))):
+            break
+        values, vectors = np.linalg.eigh(-hessian)
+        if values[-1] <= 0.0:
+            break
+        covariance = vectors / np.maximum(values, 0.05) @ vectors.T
+        step = covariance @ gradient
+        step *= min(1.0, 5.0 / max(float(np.linalg.norm(step)), 1e-12))
+        trials = top + scale * step * np.array([1.0, 0.5, 0.2, 0.05])[:, None]
+        trial_values = log_density(trials)
+        winner = int(np.argmax(trial_values))
+        if not trial_values[winner] > best + 1e-3:
+            break
+        top, best = trials[winner], float(trial_values[winner])
+        # Differences over about one standard deviation are exact enough and not lost in rounding.
+        scale = np.clip(scale * np.sqrt(np.diag(covariance)), 0.1 * scale, 10.0 * scale)
+    if covariance is not None:
+        gradient, hessian = _derivatives(log_density, top, 0.1 * scale)
+        values, vectors = np.linalg.eigh(-hessian) if np.all(np.isfinite(hessian)) else (np.zeros(1), np.eye(1))
+        covariance = None
+        if values[0] > 0.0:
+            covariance = (vectors / values @ vectors.T) * np.outer(scale, scale)
+    return top, best, covariance
+
+
+def scatter_about(
+    log_density: LogDensity,
+    top: FloatArray,
+    best: float,
+    covariance: FloatArray | None,
+    walkers: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Walkers drawn from the normal distribution that fits the top; the given ones where it does not fit the density.
+
+    Where ridges are long it takes walkers many steps to spread along them; this spares the steps.
+    """
+    if covariance is None:
+        return walkers
+    drawn = rng.multivariate_normal(top, covariance, size=6 * len(walkers), method="eigh")
+    drop = best - log_density(drawn)
+    # Samples of a normal distribution lie half of its dimension below its top, on the average.
+    good = drawn[drop < 1.5 * len(top) + 4.0]
+    return good[: len(walkers)] if len(good) >= len(walkers) else walkers
+
+
+def _derivatives(log_density: LogDensity, top: FloatArray, h: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gradient (d,) and Hessian (d, d) by central differences, in units of h / 0.1."""
+    d = len(top)
+    steps = [np.zeros(d)]
+    for i in range(d):
+        for j in range(i, d):
+            for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                step = np.zeros(d)
+                step[i] += a
+                step[j] += b
+                steps.append(step)
+    values = log_density(top + h * np.array(steps))
+    if not np.all(np.isfinite(values)):
+        return np.full(d, np.nan), np.full((d, d), np.nan)
+    gradient, hessian = np.zeros(d), np.zeros((d, d))
+    row = 1
+    for i in range(d):
+        for j in range(i, d):
+            pp, pm, mp, mm = values[row : row + 4]
+            # On the diagonal pm and mp are the point itself: the step is two h.
+            hessian[i, j] = hessian[j, i] = (pp - pm - mp + mm) / 4.0
+            if i == j:
+                gradient[i] = (pp - mm) / 4.0
+            row += 4
+    return gradient / 0.1, hessian / 0.1**2
