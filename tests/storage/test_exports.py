@@ -88,6 +88,9 @@ def launch_nodes(text: str) -> list[dict[str, object]]:
     def value(node: ast.expr) -> object:
         if isinstance(node, ast.Name):
             return constants[node.id]
+        if isinstance(node, ast.Call):  # ParameterValue(text, value_type=str)
+            assert getattr(node.func, "id", "") == "ParameterValue"
+            return value(node.args[0])
         if isinstance(node, ast.List):
             return [value(item) for item in node.elts]
         if isinstance(node, ast.Dict):

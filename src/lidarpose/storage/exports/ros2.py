@@ -73,7 +73,8 @@ def _moving(calibration: TurntableCalibration, options: ExportOptions) -> str:
 # /joint_states that carry the turntable's reading in radians under the name "{urdf.JOINT}". To try it:
 #   ros2 topic pub /joint_states sensor_msgs/msg/JointState "{{name: [{urdf.JOINT}], position: [0.0]}}"
 #   ros2 run tf2_ros tf2_echo {names.camera} {names.lidar}
-{_IMPORTS}
+{_IMPORTS}from launch_ros.parameter_descriptions import ParameterValue
+
 ROBOT_DESCRIPTION = """\\
 {description}"""
 
@@ -85,7 +86,8 @@ def generate_launch_description():
                 package="robot_state_publisher",
                 executable="robot_state_publisher",
                 name="lidarpose_state_publisher",
-                parameters=[{{"robot_description": ROBOT_DESCRIPTION}}],
+                # As a string: launch takes plain text for YAML, and trips over its colons.
+                parameters=[{{"robot_description": ParameterValue(ROBOT_DESCRIPTION, value_type=str)}}],
             ),
         ]
     )
