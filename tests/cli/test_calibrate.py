@@ -99,8 +99,8 @@ FLAWS: dict[str, tuple[Callable[[Path], object], int, str]] = {
     ),
     "a wrong board size": (
         lambda s: edit_text(s / "session.toml", lambda t: t.replace("columns = 20", "columns = 17")),
-        1,
-        "17 x",
+        2,
+        "board.panels.0: Panel 1 was not found in the bright images: expected 17 x 14 inner corners; found: 20 x 14",
     ),
     "two equal angles": (lambda s: edit_text(s / "positions.csv", same_angle), 2, "turntable_angle_deg"),
     "angles out of order": (lambda s: edit_text(s / "positions.csv", swap_rows), 2, "--any-order"),

@@ -64,9 +64,11 @@ def calibrate(
     report
         Write report.html too.
     """
+    from lidarpose.storage.atomic import prepare_folder
     from lidarpose.storage.corner_session import CORNER_SESSION_FORMAT
     from lidarpose.storage.session import SESSION_FORMAT, session_format
 
+    prepare_folder(output)
     found = session_format(session)
     if found == CORNER_SESSION_FORMAT:
         _calibrate_corners(

@@ -39,11 +39,16 @@ class BoardNotFoundError(UndeterminedError):
     ----------
     panel
         Its index in the session.
+    other_sizes
+        Columns and rows of inner corners of chessboards that are in the images and nobody asked for.
     """
 
-    def __init__(self, what: str, *, remedy: str, details: tuple[str, ...] = (), panel: int = 0) -> None:
-        super().__init__(what, remedy=remedy, details=details)
+    def __init__(
+        self, what: str, *, remedy: str, panel: int = 0, other_sizes: tuple[tuple[int, int], ...] = ()
+    ) -> None:
+        super().__init__(what, remedy=remedy)
         self.panel = panel
+        self.other_sizes = other_sizes
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +117,7 @@ def _first_shot_with_all(images: Sequence[GrayImage], panels: Sequence[Panel]) -
     failure: BoardNotFoundError | None = None
     # More than three unsuccessful shots of one scene will not be cured by a fourth.
     for index, image in enumerate(images[:3]):
-        search = _locate(image, panels)
+        search = _locate(image, panels, thorough=index == 0)
         if all(corners is not None for corners in search.grids):
             return index, [corners for corners in search.grids if corners is not None]
         failure = failure or _not_found(search, panels)
@@ -127,17 +132,19 @@ def _not_found(search: GridSearch, panels: Sequence[Panel]) -> BoardNotFoundErro
     seen += [f"{columns} x {rows}" for columns, rows in search.other_sizes[:3]]
     found = f"found: {', '.join(seen)}" if seen else "no chessboard was found at all"
     return BoardNotFoundError(
-        f"Panel {missing[0]} was not found in the bright images: "
+        f"Panel {missing[0] + 1} was not found in the bright images: "
         f"expected {panel.columns} x {panel.rows} inner corners; {found}",
         remedy="Check columns and rows (inner corners, not squares), and that the whole panel is in view, sharp, "
         "evenly lit and not over-exposed.",
         panel=missing[0],
+        other_sizes=search.other_sizes,
     )
 
 
-def _locate(image: GrayImage, panels: Sequence[Panel]) -> GridSearch:
+def _locate(image: GrayImage, panels: Sequence[Panel], *, thorough: bool = True) -> GridSearch:
     """Corners of each panel to about a pixel, equal panels in the stated order."""
-    search = find_grids(_to_8_bit(image), [(panel.columns, panel.rows) for panel in panels])
+    sizes = [(panel.columns, panel.rows) for panel in panels]
+    search = find_grids(_to_8_bit(image), sizes, thorough=thorough)
     return replace(search, grids=tuple(_in_stated_order(list(search.grids), panels)))
 
 

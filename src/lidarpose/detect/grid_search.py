@@ -40,8 +40,11 @@ class GridSearch:
     other_sizes: tuple[Size, ...]
 
 
-def find_grids(image: Image8, sizes: Sequence[Size]) -> GridSearch:
-    """Find a grid for each of `sizes` (several may be equal: different grids), wherever they are in the image."""
+def find_grids(image: Image8, sizes: Sequence[Size], *, thorough: bool = True) -> GridSearch:
+    """Find a grid for each of `sizes` (several may be equal: different grids), wherever they are in the image.
+
+    The slow detectors, seconds an image without a board, are tried only if the search is to be `thorough`.
+    """
     found: list[FloatArray | None] = [None] * len(sizes)
     others: list[Lattice] = []
     for lattices in _lattice_attempts(image):
@@ -50,7 +53,8 @@ def find_grids(image: Image8, sizes: Sequence[Size]) -> GridSearch:
         if all(corners is not None for corners in found):
             break
     else:
-        _try_detectors(image, sizes, found, others)
+        if thorough:
+            _try_detectors(image, sizes, found, others)
     return GridSearch(tuple(found), _sizes(others))
 
 

@@ -76,11 +76,11 @@ class StripeFinder:
         for k, view in enumerate(self._views):
             line = find_line(view, image)
             if isinstance(line, str):
-                problems.append(LeftOut(f"stripe on panel {k}", line))
+                problems.append(LeftOut(f"stripe on panel {k + 1}", line))
                 continue
             fit = fit_stripe(view, image, line, self._limit)
             if isinstance(fit, str):
-                problems.append(LeftOut(f"stripe on panel {k}", fit))
+                problems.append(LeftOut(f"stripe on panel {k + 1}", fit))
                 continue
             stripes[k] = fit.points
         return StripeDetection(stripes, tuple(problems))

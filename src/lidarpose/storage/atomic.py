@@ -91,6 +91,18 @@ def require_new_folder(path: Path) -> None:
         )
 
 
+def prepare_folder(path: Path) -> None:
+    """Make a folder for results, before work is done that could not be saved. Raises InputError if it cannot be."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            path, f"cannot be made: {error.strerror or error}", expected="a folder for the results"
+        ) from error
+    if not os.access(path, os.W_OK):
+        raise InputError(path, "cannot be written to", expected="a folder for the results")
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file, whole or not at all."""
     with replacing(path) as temporary:

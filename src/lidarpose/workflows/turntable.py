@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidarpose.errors import UndeterminedError
+from lidarpose.errors import InputError, UndeterminedError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose, log_so3
 from lidarpose.model.calibration import Quality, TurntableCalibration
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from lidarpose.detect.laser_stripe import StripeFinder
     from lidarpose.model.turntable_result import TurntableEstimate
     from lidarpose.refine.turntable import JointOptions
+    from lidarpose.refine.turntable_joint import Start
     from lidarpose.solve.paper import PaperSolution
 
 Step = Callable[[], None]
@@ -126,14 +127,16 @@ def detect_features(session: TurntableSession, *, step: Step | None = None) -> D
 def _detect_board(
     session: TurntableSession, placement: str, images: Sequence[Any]
 ) -> tuple[BoardDetection, StripeFinder]:
-    from lidarpose.detect.chessboard import find_panels
+    from lidarpose.detect.chessboard import BoardNotFoundError, find_panels
     from lidarpose.detect.laser_stripe import StripeFinder
 
     try:
         board = find_panels(images, session.panels)
-    except UndeterminedError as error:
+    except BoardNotFoundError as error:
         names = ", ".join(source.name for source in session.board_images[placement][:3])
-        raise UndeterminedError(f"{error.what} ({names})", remedy=error.remedy, details=error.details) from None
+        if error.other_sizes:  # the images are good; it is the session that describes another board
+            raise InputError(session.name, f"{error.what} ({names})", field=f"board.panels.{error.panel}") from None
+        raise UndeterminedError(f"{error.what} ({names})", remedy=error.remedy) from None
     return board, StripeFinder(board, images)
 
 
@@ -204,8 +207,15 @@ def refine(
     """The joint estimate, started from the closed form."""
     from lidarpose.refine.turntable import JointOptions, refine_turntable
 
-    poses = {name: tuple(p.T_camera_panel for p in panels) for name, panels in start.panel_poses.items()}
-    return refine_turntable(observations, start.motion, poses, options or JointOptions())
+    def restart(other: TurntableObservations) -> Start:
+        return _start_of(solve(other))
+
+    return refine_turntable(observations, *_start_of(start), replace(options or JointOptions(), restart=restart))
+
+
+def _start_of(paper: PaperSolution) -> Start:
+    poses = {name: tuple(p.T_camera_panel for p in panels) for name, panels in paper.panel_poses.items()}
+    return paper.motion, poses
 
 
 def paper_quality(paper: PaperSolution) -> Quality:
