@@ -5,6 +5,8 @@ import pytest
 
 from lidarpose.detect.chessboard import find_panels
 from lidarpose.detect.laser_stripe import StripeFinder
+from lidarpose.simulate.rig import draw_rig, paper_camera
+from lidarpose.simulate.session import SimulationOptions, simulate_session
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +53,74 @@ def test_stripes_lie_where_the_sheet_is(two_panels, shots, finder, azimuth_deg, 
         weight = points.sigma_px**-2.0
         assert weight @ np.abs(error) / weight.sum() < 0.05
         assert 0.3 < np.median(np.abs(error / points.sigma_px)) < 1.2
+
+
+@pytest.mark.parametrize("level", [25.0, 1500.0])
+def test_faint_and_saturated_stripes(two_panels, finder, level) -> None:
+    normal, offset = sheet(84.0, (0.0, 0.013, 1.0))
+    clean = two_panels.stripe(normal, offset, 0.0011, level)
+    found = finder.find(two_panels.noisy(clean, np.random.default_rng(8)))
+    assert set(found.stripes) == {0, 1}
+    for k, points in found.stripes.items():
+        error = errors(two_panels, two_panels.boards[k], normal, offset, points)
+        weight = points.sigma_px**-2.0
+        # Little light, or only the skirts of it: less exact, and stated so.
+        assert weight @ np.abs(error) / weight.sum() < 0.12
+        assert np.sqrt(((error / points.sigma_px) ** 2).mean()) < 2.0
+
+
+def test_a_long_glare_is_not_taken_for_the_stripe(two_panels, finder) -> None:
+    normal, offset = sheet(90.0, (0.0, 0.04, 1.0))
+    v, u = np.indices((two_panels.height, two_panels.width))
+    glare = 900.0 * np.exp(-0.5 * (((u - 420) / 60.0) ** 2 + ((v - 190) / 9.0) ** 2))
+    clean = two_panels.stripe(normal, offset, 0.0011) + glare
+    found = finder.find(two_panels.noisy(clean, np.random.default_rng(9)))
+    assert set(found.stripes) == {0, 1}
+    for k, points in found.stripes.items():
+        error = errors(two_panels, two_panels.boards[k], normal, offset, points)
+        assert np.abs(error).max() < 1.0
+
+
+def test_a_moved_board_is_named(two_panels, finder) -> None:
+    lit = np.roll(two_panels.bright(), 13, axis=1)
+    found = finder.find(two_panels.noisy(lit, np.random.default_rng(10)))
+    assert not found.stripes
+    assert all("moved" in p.reason for p in found.problems)
+
+
+def test_board_and_stripe_in_one_image(two_panels) -> None:
+    normal, offset = sheet(84.0, (0.0, 0.013, 1.0))
+    clean = 0.5 * two_panels.bright() + two_panels.stripe(normal, offset, 0.0011, 120.0)
+    image = two_panels.noisy(clean, np.random.default_rng(12))
+    board = find_panels([image], [b.panel for b in two_panels.boards])
+    found = StripeFinder(board, [image]).find(image)
+    assert set(found.stripes) == {0, 1}
+    for k, points in found.stripes.items():
+        error = errors(two_panels, two_panels.boards[k], normal, offset, points)
+        weight = points.sigma_px**-2.0
+        assert weight @ np.abs(error) / weight.sum() < 0.06
+
+
+def test_stated_errors_are_true_on_a_simulated_session() -> None:
+    rig = draw_rig(4, camera=paper_camera(812, 617), places=5)
+    session = simulate_session(rig, options=SimulationOptions(board_shots=2)).session
+    shots = [source.load() for source in session.board_images[""]]
+    board = find_panels(shots, rig.panels)
+    finder = StripeFinder(board, shots)
+    centres = [rig.camera.project(T.translation) for T in rig.T_camera_panel[""]]
+    standardised = []
+    for place in (1, 3):
+        for k, points in finder.find(session.places[place].stripe_image.load()).stripes.items():
+            panel = int(np.argmin([np.linalg.norm(c - board.corners[k].pixels, axis=1).min() for c in centres]))
+            ends = rig.chord(place, panel)
+            along = ends[0] + np.linspace(-0.05, 1.05, 8001)[:, None] * (ends[1] - ends[0])
+            line = rig.camera.project(rig.T_camera_panel[""][panel] @ along)
+            nearest = np.argmin(((points.pixels[:, None] - line[None]) ** 2).sum(-1), axis=1)
+            error = ((points.pixels - line[nearest]) * points.normals).sum(-1)
+            assert np.abs(error).mean() < 0.1
+            standardised.append(error / points.sigma_px)
+    assert len(standardised) == 4
+    assert 0.7 < np.sqrt((np.concatenate(standardised) ** 2).mean()) < 1.5
 
 
 def test_darkness_has_no_stripe(two_panels, finder) -> None:

@@ -31,16 +31,12 @@ _MIN_POINTS = 8
 _FIRST_HALF = 12
 # A profile whose own centre is worse than this tells nothing.
 _WORST_SIGMA_PX = 0.8
-# How well the squares' edges are known, pixels; twice, because the profiles of a block share the error.
-_EDGE_SIGMA_PX = 2.0 * 0.02
 # Profiles without light keep to the curve by this pull, nothing against a real profile's hundredths.
 _PULL_PX = 1.5
-# Step of the derivative by the edges' shift, pixels.
-_EDGE_STEP = 0.1
 # Pixels that the noise is learnt from, and the bins they are sorted into.
 _NOISE_SAMPLES, _NOISE_BINS = 2000, 8
-# Order of the unknowns: the first four are each profile's own, the width is common.
-_BACKGROUND, _HEIGHT, _EDGE, _CENTRE, _WIDTH = range(5)
+# Order of the unknowns: the first three are each profile's own, the width is common.
+_BACKGROUND, _HEIGHT, _CENTRE, _WIDTH = range(4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +89,7 @@ class _Band:
 
     u : (N,); v : (N, P) pixel coordinates; values, bright : grey levels; good : pixels that count;
     ambient : light that was taken out of the values; cosine, sine : (N,) of the stripe's inclination;
-    light, by_edge : share of light surface that each pixel sees, and its change when the edges move by a pixel.
+    light : share of light surface that each pixel sees.
     """
 
     u: FloatArray
@@ -105,7 +101,6 @@ class _Band:
     cosine: FloatArray
     sine: FloatArray
     light: FloatArray
-    by_edge: FloatArray
 
     @property
     def half(self) -> int:
@@ -204,7 +199,7 @@ def _cut(
     slope = curve.slope(u)
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
     nothing = np.zeros_like(values)
-    return _Band(u, v.astype(np.float32), values, bright, good, nothing, cosine, slope * cosine, nothing, nothing)
+    return _Band(u, v.astype(np.float32), values, bright, good, nothing, cosine, slope * cosine, nothing)
 
 
 def _half_height(curve: _Curve, u: FloatArray, width: float) -> int:
@@ -327,16 +322,12 @@ def _look_at_albedo(band: _Band, view: PanelView, steep: bool, curve: _Curve, wi
     edges = np.sqrt(blur2 * (thickness * across**2 + along**2))
     # A pixel at (0, dv) from the centre is seen at dv along the stripe's tangent plus `thickness` of it across.
     dv = band.v - _column(centre)
-    per_v = by_v * _column(cosine**2 * thickness + band.sine**2) + by_u * _column(
-        (1.0 - thickness) * cosine * band.sine
-    )
+    per_v = by_v * _column(cosine**2 * thickness + band.sine**2)
+    per_v = np.asarray(per_v + by_u * _column((1.0 - thickness) * cosine * band.sine), dtype=np.float32)
     inside = _inside_squares(view, grid, across, width)
-    shares = []
-    for moved in (-_EDGE_STEP, _EDGE_STEP):
-        x, y = (dv * per_v[:, k, None] + (grid[:, k] - moved * across[:, k])[:, None] for k in (0, 1))
-        shares.append(albedo.light_share(x, y, edges[:, 0, None], edges[:, 1, None]))
-    light, by_edge = 0.5 * (shares[0] + shares[1]), (shares[1] - shares[0]) / np.float32(2.0 * _EDGE_STEP)
-    return replace(band, light=light, by_edge=by_edge, good=band.good * inside[:, None])
+    x, y = (dv * per_v[:, k, None] + _column(grid[:, k]) for k in (0, 1))
+    light = albedo.light_share(x, y, _column(edges[:, 0]), _column(edges[:, 1]))
+    return replace(band, light=light, good=band.good * inside[:, None])
 
 
 def _inside_squares(view: PanelView, grid: FloatArray, across: FloatArray, width: float) -> FloatArray:
@@ -357,7 +348,6 @@ def _step(band: _Band, state: _State, curve: _Curve, *, learn: bool) -> _State:
     ratio, height = np.float32(state.dark_ratio), _column(state.height)
     by_height = bell * (ratio + (1 - ratio) * band.light)
     signal = height * by_height
-    tall = height * bell
     rest = band.values - _column(state.background)
     residual = rest - signal
     level = np.maximum(band.values + band.ambient, np.float32(0.0))
@@ -367,14 +357,12 @@ def _step(band: _Band, state: _State, curve: _Curve, *, learn: bool) -> _State:
     J = [
         np.ones_like(signal),
         by_height,
-        tall * ((1 - ratio) * band.by_edge),
         signal * distance * _column(band.cosine / state.width),
         signal * squared,
     ]
     M = _normal_equations(J, residual, weight)
     M[_BACKGROUND][0] += 1e-9
     M[_HEIGHT][0] += 1e-9
-    M[_EDGE][0] += 1.0 / _EDGE_SIGMA_PX**2
     M[_CENTRE][0] += 1.0 / _PULL_PX**2
     M[_CENTRE][-1] += (curve.at(band.u) - state.centre) / _PULL_PX**2
     change, by_width, information = _solve(M)
@@ -402,7 +390,7 @@ def _normal_equations(J: list[FloatArray], residual: FloatArray, weight: FloatAr
 
 
 def _solve(rows: list[FloatArray]) -> tuple[list[FloatArray], float, FloatArray]:
-    """Changes (N,) of the profiles' four unknowns, of the width's logarithm, and the centres' information (N,).
+    """Changes (N,) of the profiles' own unknowns, of the width's logarithm, and the centres' information (N,).
 
     Gauss's elimination of each profile's own unknowns, what is left summed over the profiles. `rows` are used up.
     """

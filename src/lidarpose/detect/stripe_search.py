@@ -271,8 +271,10 @@ def _is_elsewhere(view: PanelView, small: FloatArray, template: FloatArray) -> b
     if len(inner) < 10:
         return False
     seen, expected = small.ravel()[inner], template.ravel()[inner]
-    low, high = np.percentile(seen, [10.0, 80.0])
-    if high - low < _LIT_SHARE * float(np.percentile(expected, 80.0) - np.percentile(expected, 10.0)):
+    tenth, eighth = len(inner) // 10, 8 * len(inner) // 10
+    low, high = np.partition(seen, (tenth, eighth))[[tenth, eighth]]
+    dark, light = np.partition(expected, (tenth, eighth))[[tenth, eighth]]
+    if high - low < _LIT_SHARE * (light - dark):
         return False
     # Clipped: a glare or the stripe itself must not decide.
     correlation = np.corrcoef(np.clip(seen, low, high), expected)[0, 1]
@@ -375,10 +377,12 @@ def _consensus(
 
 def _erase(ridge: FloatArray, line: _SmallLine, steep: bool) -> None:
     """Blank the line in a ridge image (transposed if `steep`), wide enough for the skirts of a saturated stripe."""
-    v, u = np.ogrid[: ridge.shape[0], : ridge.shape[1]]
-    x, y = (u, v) if steep == line.steep else (v, u)
-    reach = max(6.0, 0.08 * min(ridge.shape)) * np.sqrt(1.0 + line.slope**2)
-    ridge[np.abs(line.intercept + line.slope * x - y) <= reach] = 0.0
+    reach = int(max(6.0, 0.08 * min(ridge.shape)) * np.sqrt(1.0 + line.slope**2))
+    field = ridge if steep == line.steep else ridge.T
+    x = np.arange(field.shape[1])
+    middle = np.rint(line.intercept + line.slope * x).astype(np.intp)
+    y = np.clip(middle + np.arange(-reach, reach + 1)[:, None], 0, field.shape[0] - 1)
+    field[y, x] = 0.0
 
 
 def _to_image(line: _SmallLine, view: PanelView, share: float) -> CoarseLine:
