@@ -108,6 +108,8 @@ def test_kalibr_s_camchain(tmp_path: Path) -> None:
     [
         ("camera_model: pinhole", "camera_model: omni", "camera_model"),
         ("radtan", "fov", "distortion_model"),
+        ("radtan", "[radtan]", "distortion_model"),
+        ("458.6", "1" + 400 * "0", "intrinsics"),
         ("[458.6, 457.3, 367.2, 248.4]", "[458.6, 457.3]", "intrinsics"),
         ("[458.6, 457.3, 367.2, 248.4]", "[458.6, -457.3, 367.2, 248.4]", "focal"),
         ("[458.6,", "[.nan,", "intrinsics"),
@@ -128,6 +130,18 @@ def test_ros_camera_info_is_still_one(tmp_path: Path) -> None:
     camera = Camera(640, 480, K, "plumb_bob", np.array([0.1, 0.0, 0.0, 0.0, 0.0]))
     write_camera_info(tmp_path / "c.yaml", camera)
     np.testing.assert_array_equal(read_camera(tmp_path / "c.yaml").K, K)
+
+
+@pytest.mark.parametrize("value", ["1" + 400 * "0", "-.inf", "[1]", "yes", "1e999"])
+@pytest.mark.parametrize("key", ["distortion_model: ", "  data: [", "image_width: "])
+def test_a_camera_info_with_something_else_for_a_number(tmp_path: Path, key: str, value: str) -> None:
+    write_camera_info(tmp_path / "c.yaml", Camera(640, 480, K))
+    text = (tmp_path / "c.yaml").read_text()
+    start = text.index(key) + len(key)
+    end = min(k for k in (text.find(mark, start) for mark in ",\n") if k > 0)
+    (tmp_path / "c.yaml").write_text(text[:start] + value + text[end:])
+    with pytest.raises(InputError, match=r"c\.yaml"):
+        read_camera(tmp_path / "c.yaml")
 
 
 @pytest.mark.parametrize(

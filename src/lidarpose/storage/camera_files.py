@@ -137,7 +137,7 @@ def _kalibr(path: Path, document: Mapping[str, Any]) -> Camera:
     if model != "pinhole":
         raise InputError(path, f"is {model!r}", field=f"{name}.camera_model", expected="pinhole")
     distortion = entry.get("distortion_model", "none")
-    if distortion not in _KALIBR_MODELS:
+    if not isinstance(distortion, str) or distortion not in _KALIBR_MODELS:
         expected = " or ".join(_KALIBR_MODELS)
         raise InputError(path, f"is {distortion!r}", field=f"{name}.distortion_model", expected=expected)
     intrinsics = _numbers(path, f"{name}.intrinsics", entry["intrinsics"])

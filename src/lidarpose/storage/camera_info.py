@@ -33,7 +33,7 @@ def read_camera_info(path: Path) -> Camera:
     model = keys.get("distortion_model", "plumb_bob")
     if model in ("fisheye", "kannala_brandt"):
         model = "equidistant"
-    if model not in COEFFICIENT_COUNTS:
+    if not isinstance(model, str) or model not in COEFFICIENT_COUNTS:
         raise InputError(path, f"is {model!r}", field="distortion_model", expected=" or ".join(COEFFICIENT_COUNTS))
     distortion = _numbers(path, keys, "distortion_coefficients", COEFFICIENT_COUNTS[model])
     try:
@@ -75,7 +75,8 @@ def _numbers(path: Path, keys: dict[str, Any], key: str, counts: tuple[int, ...]
         found = f"holds {len(value)} numbers" if isinstance(value, list) else "is no list of numbers"
         raise InputError(path, found, field=key, expected=expected)
     for entry in value:
-        if isinstance(entry, bool) or not isinstance(entry, int | float) or not np.isfinite(entry):
+        # The comparison fails for NaN, infinity, and whole numbers too large for a float.
+        if isinstance(entry, bool) or not isinstance(entry, int | float) or not abs(entry) < 1e300:
             raise InputError(path, f"holds {entry!r}", field=key, expected=expected)
     return [float(entry) for entry in value]
 
