@@ -14,6 +14,7 @@ from lidarpose.model.observation import PlaceFeatures, PlaceObservation, ScanLin
 from lidarpose.simulate.observations import simulate_observations
 from lidarpose.simulate.rig import FAMILIES, draw_rig
 from lidarpose.solve.assignment import Assignment, assign
+from lidarpose.solve.assignment_blind import motion_without_stripes
 from lidarpose.solve.paper import board_poses, solve_paper
 
 
@@ -134,3 +135,25 @@ def test_a_rival_that_differs_at_one_place_alone_is_no_rival() -> None:
 
 def part_of(line: ScanLine, start: int, stop: int) -> ScanLine:
     return ScanLine(line.angle_rad[start:stop], line.range_m[start:stop], line.sigma_m[start:stop])
+
+
+def test_without_any_stripe_two_placements_of_the_board_decide() -> None:
+    rig = draw_rig(7, family="paper", places=8, placements=2)
+    observations = simulate_observations(rig, with_stripe=False, seed=1)
+    result = assigned(observations, panels=observations.panels)
+    assert wrong_places(result.places, {p.position: p for p in observations.places}) == []
+    assert len(result.places) == 16
+    poses = {name: board_poses(observations.camera, c, name) for name, c in observations.corners.items()}
+    again = motion_without_stripes(replace(observations, places=result.places), poses)
+    for reading in rig.turntable_angle_rad:
+        assert again.pose(reading).distance(result.motion.pose(reading))[0] < 1e-4
+        metres, radians = result.motion.pose(reading).distance(rig.motion.pose(reading))
+        assert metres < 0.02
+        assert radians < 0.02
+
+
+def test_without_any_stripe_one_placement_is_refused(rig_maker: Callable[..., Any]) -> None:
+    observations = rig_maker(6, places=5).observe(0, 0.05, 0.1, 1e-3)
+    dark = tuple(replace(p, stripes={}) for p in observations.places)
+    with pytest.raises(UndeterminedError, match="slide along the fold"):
+        assigned(replace(observations, places=dark), panels=observations.panels)

@@ -85,3 +85,6 @@ def test_what_determines_nothing_is_refused(rig_maker: Callable[..., Any]) -> No
     dark = tuple(replace(p, stripes={0: p.stripes[0]}) for p in observations.places)
     with pytest.raises(UndeterminedError, match="no usable stripe on panel 2"):
         solve_paper(replace(observations, places=dark))
+    darker = tuple(replace(p, stripes={}) for p in observations.places)
+    with pytest.raises(UndeterminedError, match="no image shows it"):
+        solve_paper(replace(observations, places=darker))

@@ -25,7 +25,9 @@ from lidarpose.geometry.planes import Plane, fit_plane, intersect_three_planes
 from lidarpose.geometry.se3 import Pose, UncertainPose, log_so3, rotation_z
 from lidarpose.model.camera import Camera
 from lidarpose.model.observation import LeftOut, PlaceFeatures, PlaceObservation, ScanLine, StripePoints
+from lidarpose.model.targets import Panel
 from lidarpose.model.turntable import TurntableMotion
+from lidarpose.solve.assignment_blind import choose_without_stripes
 from lidarpose.solve.light_plane import StripePair, stripe_on_panel, stripe_pair
 from lidarpose.solve.line_pair import FittedLine, fit_line_pair, fit_scan_line, free_directions
 from lidarpose.solve.panel_pose import PanelPose
@@ -83,7 +85,7 @@ class Assignment:
         The motion that the choice rests on; a start for better estimates.
     decided_by
         What told the solution from its rival: "the motion of all places", "the ends of the lines",
-        "the order given by --first-panel" or "no rival".
+        "the order given by --first-panel", "all placements of the board" or "no rival".
     figures
         The evidence as numbers, units in the keys.
     """
@@ -144,9 +146,13 @@ def assign(
     panel_poses: Mapping[str, Sequence[PanelPose]],
     places: Sequence[PlaceFeatures],
     *,
+    panels: Sequence[Panel] | None = None,
     first_panel: int | None = None,
 ) -> Assignment:
     """Find the two scan lines on the board at every place, and which panel each lies on.
+
+    Sessions without any stripe are assigned too, if the board had several placements and `panels` are given
+    (`lidarpose.solve.assignment_blind`).
 
     Parameters
     ----------
@@ -154,6 +160,8 @@ def assign(
         By placement of the board: the poses of panel 0 and panel 1.
     places
         Stripes by panel, and the scans' straight lines in any order.
+    panels
+        The chessboards, in the session's order; needed only without stripes.
     first_panel
         The user's hint: the panel, 0 or 1, that the line of smaller beam angle lies on (1 or 2 on the command line).
 
@@ -164,6 +172,8 @@ def assign(
     InputError
         If the hint contradicts the places' motion.
     """
+    if panels is not None and not any(len(s) for place in places for s in place.stripes.values()):
+        return _without_stripes(panels, panel_poses, places, first_panel)
     reasons: dict[int, str] = {}
     candidates: list[_Candidate] = []
     for k, place in enumerate(places):
@@ -185,6 +195,23 @@ def assign(
         )
     best, decided_by, figures = _decide(pool, solutions, places, panel_poses, first_panel)
     return _assignment(pool, best, places, reasons, decided_by, figures)
+
+
+def _without_stripes(
+    panels: Sequence[Panel],
+    panel_poses: Mapping[str, Sequence[PanelPose]],
+    places: Sequence[PlaceFeatures],
+    first_panel: int | None,
+) -> Assignment:
+    choice = choose_without_stripes(panels, panel_poses, places, first_panel=first_panel)
+    assigned = []
+    for k, (i, j) in sorted(choice.lines.items()):
+        place = places[k]
+        lines = {0: place.lines[i], 1: place.lines[j]}
+        assigned.append(PlaceObservation(place.position, place.turntable_angle_rad, {}, lines, place.placement))
+    _require_places(np.array([p.turntable_angle_rad for p in assigned]), places, choice.reasons)
+    left_out = tuple(LeftOut(f"position {places[k].position}", reason) for k, reason in sorted(choice.reasons.items()))
+    return Assignment(tuple(assigned), left_out, choice.motion, "all placements of the board", choice.figures)
 
 
 # --- one place -----------------------------------------------------------------------------------------------------
