@@ -77,8 +77,8 @@ def solve_paper(
     if observations.places and not any(len(s) for place in observations.places for s in place.stripes.values()):
         raise UndeterminedError(
             "The paper's method needs the laser's stripe, and no image shows it",
-            remedy="Make the stripe visible (dark room, long exposure, no infrared filter), or record several placements "
-            "of the board and use the joint estimate",
+            remedy="Make the stripe visible (dark room, long exposure, no infrared filter), or record several "
+            "placements of the board and use the joint estimate",
             details=tuple(f"{item.what}: {item.reason}" for item in observations.left_out),
         )
     panel_poses = {name: board_poses(observations.camera, c, name) for name, c in observations.corners.items()}

@@ -186,7 +186,7 @@ def assign_lines(
     corners = {name: board.corners for name, board in features.boards.items()}
     unassigned = TurntableObservations(session.camera, session.panels, corners, (), session.lidar, features.left_out)
     panel_poses = {name: board_poses(session.camera, corners[name], name) for name in corners}
-    assignment = assign(session.camera, panel_poses, features.places, first_panel=first_panel)
+    assignment = assign(session.camera, panel_poses, features.places, panels=session.panels, first_panel=first_panel)
     left_out = merge_left_out(features.left_out, assignment.left_out)
     return replace(unassigned, places=assignment.places, left_out=left_out)
 
