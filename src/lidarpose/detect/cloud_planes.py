@@ -30,19 +30,33 @@ NEIGHBOURHOODS = (10, 20, 40, 80)
 POINTS_PER_HYPOTHESIS = 10
 GATE_SIGMAS = 3.0
 MIN_SIGMA_M = 2e-4
+# A real wall or floor is less flat than its neighbourhoods say, by up to this factor.
+WIDEST = 5.0
 # A patch is connected across gaps of this share of its range, which spans the lines of a 16-beam LiDAR on a slope.
 GAP_PER_RANGE = 0.06
 MIN_GAP_M = 0.04
+# Sine of the angle below which a surface counts as seen edge-on.
+EDGE_ON = 0.06
 
 
 @dataclass(frozen=True)
 class PlaneSearch:
-    """What to look for. `max_planes` ends the search early; patches of fewer than `min_points` are not reported."""
+    """What to look for.
+
+    Attributes
+    ----------
+    max_planes, min_points, min_share
+        The search ends early at `max_planes`; patches of fewer points, or of a smaller share of all, are not reported.
+    from_sensor
+        The origin is where the sensor stands. Then planes seen edge-on are no surfaces: each scan line of a multi-beam
+        LiDAR lies in one.
+    """
 
     max_planes: int = 40
     min_points: int = 30
     min_share: float = 0.0
     max_rounds: int = 6
+    from_sensor: bool = False
     seed: int = 0
 
 
@@ -82,7 +96,7 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
         remaining = np.flatnonzero(free)
         if len(remaining) < max(least, POINTS_PER_HYPOTHESIS) or len(patches) >= search.max_planes:
             break
-        sample = _draw(x, remaining, sigma_m, rng)
+        sample = _draw(x, remaining, sigma_m, search.from_sensor, rng)
         found = _harvest(x, free, sample, least, search.max_planes - len(patches))
         if not found:
             break
@@ -91,7 +105,9 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
     return tuple(patches)
 
 
-def _draw(x: Float32Array, remaining: IntArray, sigma_m: float | None, rng: np.random.Generator) -> _Sample:
+def _draw(
+    x: Float32Array, remaining: IntArray, sigma_m: float | None, from_sensor: bool, rng: np.random.Generator
+) -> _Sample:
     """Draw a subsample of the remaining points, and hypotheses around random points of it."""
     from scipy.spatial import cKDTree
 
@@ -110,6 +126,8 @@ def _draw(x: Float32Array, remaining: IntArray, sigma_m: float | None, rng: np.r
     picks = (rng.random((count, POINTS_PER_HYPOTHESIS)) * reach[:, None]).astype(np.int64)
     chosen = points[np.take_along_axis(neighbours, picks, axis=1)]
     planes, thickness, flat = _local_planes(chosen)
+    if from_sensor:
+        flat &= np.abs(planes[:, 3]) > EDGE_ON * np.linalg.norm(chosen.mean(axis=1), axis=1)
     if sigma_m is None:
         sigma_m = _noise_from_neighbourhoods(thickness[flat])
     planes = planes[flat & (thickness < 4.0 * sigma_m)]
@@ -269,7 +287,7 @@ def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, comp
     occupied[raster.cells(seen)] = True
     allowed = np.append(_grown(occupied[:-1].reshape(raster.shape)).ravel(), False)
     sigma_m = sample.sigma_m
-    reach = np.float32(3.0 * GATE_SIGMAS * sigma_m)
+    reach = np.float32(WIDEST * GATE_SIGMAS * sigma_m)
     distance = x @ plane.normal.astype(np.float32) - np.float32(plane.offset)
     near = np.flatnonzero((np.abs(distance) < reach) & free)
     near = near[allowed[raster.cells(x[near])]]
@@ -281,7 +299,9 @@ def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, comp
             return None
         plane = _moment_plane(x[chosen])
         residual = x[chosen] @ plane.normal.astype(np.float32) - np.float32(plane.offset)
-        sigma_m = min(max(mad_sigma(residual, centred=True), MIN_SIGMA_M, 0.5 * sample.sigma_m), 3.0 * sample.sigma_m)
+        sigma_m = min(
+            max(mad_sigma(residual, centred=True), MIN_SIGMA_M, 0.5 * sample.sigma_m), WIDEST * sample.sigma_m
+        )
     # A plane stands out from what is around it: a slab through scattered clutter does not.
     distance = x[near] @ plane.normal.astype(np.float32) - np.float32(plane.offset)
     around = int(np.count_nonzero(np.abs(distance) < 2.0 * GATE_SIGMAS * sigma_m))

@@ -85,10 +85,11 @@ def _candidate(
         if len(around) < MIN_FACE_POINTS or distance.min() > MAX_MISSING_M:
             return None
         local.append(around)
-    convex = _common_side(local, faces)
+    convex = _common_side([_next_to_corner(p, local, corner) for p in local], faces)
     if convex is None:
         return None
     local = [_within_common_reach(p, local, corner) for p in local]
+    local = [_on_its_side(p, k, faces, convex) for k, p in enumerate(local)]
     if min(len(p) for p in local) < MIN_FACE_POINTS:
         return None
     outlines = [_outline(p, f.plane) for p, f in zip(local, faces, strict=True)]
@@ -122,6 +123,24 @@ def _common_side(local: list[FloatArray], faces: list[PlanePatch]) -> bool | Non
             else:
                 return None
     return convex[0] if len(set(convex)) == 1 else None
+
+
+def _next_to_corner(points: FloatArray, local: list[FloatArray], corner: FloatArray) -> FloatArray:
+    """The points that tell how the faces meet: farther out, a face's plane may go on behind another face."""
+    reach = min(float(np.quantile(np.linalg.norm(p - corner, axis=1), 0.98)) for p in local)
+    close = points[np.linalg.norm(points - corner, axis=1) <= 0.7 * reach]
+    return np.asarray(close) if len(close) >= MIN_FACE_POINTS else points
+
+
+def _on_its_side(points: FloatArray, face: int, faces: list[PlanePatch], convex: bool) -> FloatArray:
+    """Points of one face on the right side of the other two."""
+    keep = np.ones(len(points), dtype=bool)
+    for j in range(3):
+        if j != face:
+            height = faces[j].plane.distance(points)
+            tolerance = 3.0 * max(faces[face].sigma_m, faces[j].sigma_m)
+            keep &= height < tolerance if convex else height > -tolerance
+    return np.asarray(points[keep])
 
 
 def _within_common_reach(points: FloatArray, local: list[FloatArray], corner: FloatArray) -> FloatArray:

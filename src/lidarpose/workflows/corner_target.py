@@ -25,6 +25,8 @@ MIN_FACE_RETURNS = 12
 GATE_SIGMAS = 6.5
 FIRST_GATE_M = 0.05
 SPOT_RAD = np.radians(1.2)
+# Beams of a multi-beam LiDAR are off by about one sigma each, all frames alike: that is no reason to drop them.
+ODD_SPOT_SIGMAS = 1.75
 # The share of a face next to the corner on which the first fit stands, before its far edges are trusted.
 INNER_SHARE = 0.6
 
@@ -137,7 +139,7 @@ def place_corners(place: CornerPlace, seed: int = 0, frame: int = 0) -> tuple[Co
     if place.near is not None:
         offset = points - place.near.astype(points.dtype)
         points = points[np.einsum("ij,ij->i", offset, offset) < HINT_CROP_M**2]
-    patches = segment_planes(points, PlaneSearch(seed=seed))
+    patches = segment_planes(points, PlaneSearch(from_sensor=True, seed=seed))
     return find_corners(points, patches, place.near, NEAR_RADIUS_M)
 
 
@@ -285,7 +287,7 @@ def _second_screening(returns: FaceReturns, normal: FloatArray, corner: FloatArr
     cell = direction_cells(returns.directions, SPOT_RAD)
     count = np.bincount(cell)
     mean = np.bincount(cell, residual) / count
-    odd = (np.abs(mean) > 0.75 * sigma_m) & (np.abs(mean) * np.sqrt(count) > 4.5 * sigma_m)
+    odd = (np.abs(mean) > ODD_SPOT_SIGMAS * sigma_m) & (np.abs(mean) * np.sqrt(count) > 4.5 * sigma_m)
     keep = ~odd[cell]
     return FaceReturns(returns.directions[keep], returns.range_m[keep], returns.frame[keep])
 
@@ -300,6 +302,9 @@ def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> Fre
             inner = step < 2
             mask = mask_of(sighting, corner, normals, INNER_SHARE if inner else 1.0)
             faces = select_faces(crop, mask, gate_m, None if inner else sigma_m)
+            if inner and (len(faces) < 3 or not _reaches_both_ways(faces)):
+                # Too few scan lines cross the inner parts: the whole faces have to do.
+                continue
             if len(faces) < 3:
                 return None
             fit = fit_corner(faces, normals, corner, sigma_m)
@@ -308,6 +313,15 @@ def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> Fre
     except UndeterminedError:
         return None
     return fit if np.linalg.norm(corner - sighting.corner) < 0.15 else None
+
+
+def _reaches_both_ways(faces: dict[int, FaceReturns]) -> bool:
+    """Whether each face's returns are spread over two directions, not along one scan line."""
+    for returns in faces.values():
+        spread = np.linalg.svd(returns.directions - returns.directions.mean(axis=0), compute_uv=False)
+        if spread[1] < 0.1 * spread[0]:
+            return False
+    return True
 
 
 def observe(

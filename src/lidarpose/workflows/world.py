@@ -149,7 +149,7 @@ def _joint(
 ) -> WorldRun:
     mended = _usable_world(session, found)
     fits = _place_fits(session, found, crops)
-    start, sigma_m = _start(mended, fits)
+    start, sigma_m = _start(mended, found, fits)
     corners = _corners(start, fits, found)
     places, left_out = observe(mended, found, crops, corners, start.normals, sigma_m)
     places, frame_scatter, dropped = _without_odd_frames(places, corners, start.normals, sigma_m)
@@ -221,23 +221,29 @@ def _place_fits(session: CornerSession, found: FoundTarget, crops: Sequence[Plac
     ]
 
 
-def _start(session: CornerSession, fits: Sequence[FreeCorner | None]) -> tuple[CornerState, float]:
-    """The closed form on the corners of the places that stand by themselves."""
-    known = [(p, f) for p, f in zip(session.places, fits, strict=True) if f is not None]
-    if len(known) < 3:
-        raise UndeterminedError(
-            f"only {len(known)} places show three faces well enough to fit",
-            remedy="Bring the target nearer, or turn it so that several scan lines cross each face.",
-        )
-    world = np.stack([p.corner_world for p, _ in known])
-    lidar = np.stack([f.corner for _, f in known])
-    reference = known[0][1].normals
-    aligned = np.stack([f.normals[list(face_order(f.normals, reference)[0])] for _, f in known])
-    normals = np.median(aligned, axis=0)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    sigma_m = float(np.median([f.sigma_m for _, f in known]))
+def _start(session: CornerSession, found: FoundTarget, fits: Sequence[FreeCorner | None]) -> tuple[CornerState, float]:
+    """The closed form on the corners of the places: fitted ones, or as sighted where too few could be fitted."""
+    corners, normals, sigmas, world = [], [], [], []
+    enough = sum(f is not None for f in fits) >= 3
+    for place, sighting, fit in zip(session.places, found.sightings, fits, strict=True):
+        if fit is not None:
+            corners.append(fit.corner)
+            normals.append(fit.normals)
+            sigmas.append(fit.sigma_m)
+        elif sighting is not None and not enough:
+            corners.append(sighting.corner)
+            normals.append(sighting.normals)
+            sigmas.append(2.0 * sighting.sigma_m)
+        else:
+            continue
+        world.append(place.corner_world)
+    reference = normals[0]
+    aligned = np.stack([n[list(face_order(n, reference)[0])] for n in normals])
+    common = np.median(aligned, axis=0)
+    common /= np.linalg.norm(common, axis=1, keepdims=True)
     errors = np.zeros((len(session.places), 3))
-    return CornerState(svd_pose(world, lidar), normals, 1.0, errors), sigma_m
+    pose = svd_pose(np.stack(world), np.stack(corners))
+    return CornerState(pose, common, 1.0, errors), float(np.median(sigmas))
 
 
 def _corners(start: CornerState, fits: Sequence[FreeCorner | None], found: FoundTarget) -> FloatArray:
