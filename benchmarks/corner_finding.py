@@ -24,7 +24,7 @@ from lidarpose.workflows.world import calibrate_world
 
 
 def random_scene(seed: int) -> tuple[CornerSceneSpec, CornerSession, CornerTruth]:
-    """A scene drawn from a seed; seeds whose instrument sees no whole target or whose places lie on one line are passed over."""
+    """A scene drawn from a seed, one in which the instrument sees whole targets at places off one line."""
     rng = np.random.default_rng([seed, 2026])
     while True:
         angles = rng.uniform(-180.0, 180.0), rng.uniform(5.0, 30.0), rng.uniform(-8.0, 8.0)

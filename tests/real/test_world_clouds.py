@@ -48,7 +48,7 @@ def test_a_still_carton_before_a_16_line_lidar() -> None:
     assert scatter.max() < 0.5e-3
     # The lines of this LiDAR are off by up to 12 mm each, all frames alike, and each face is met by five to eleven of
     # them: averaging leaves the angles as wrong as those make them.
-    angles = np.degrees(np.arccos(fit.normals @ fit.normals.T))[np.triu_indices(3, 1)]
+    angles = np.degrees(np.arccos((fit.normals @ fit.normals.T)[np.triu_indices(3, 1)]))
     assert np.abs(angles - 90.0).max() < 3.5
     assert np.sort(np.abs(angles - 90.0))[1] < 1.5
 
