@@ -24,9 +24,10 @@ Float32Array = NDArray[np.float32]
 
 SAMPLE_SIZE = 4096
 HYPOTHESES = 1000
-# Neighbourhoods of a hypothesis, in nearest points of the subsample: wide ones reach across the gaps between the lines
-# of a multi-beam LiDAR, narrow ones fit on small faces.
-NEIGHBOURHOODS = (10, 20, 40, 80)
+# Neighbourhoods of a hypothesis, in nearest points of the subsample and of a quarter of it: wide ones reach
+# across the gaps between the lines of a multi-beam LiDAR, narrow ones fit on small faces.
+NEIGHBOURHOODS = (10, 20)
+THINNED = 4
 POINTS_PER_HYPOTHESIS = 10
 GATE_SIGMAS = 3.0
 MIN_SIGMA_M = 2e-4
@@ -109,8 +110,6 @@ def _draw(
     x: Float32Array, remaining: IntArray, sigma_m: float | None, from_sensor: bool, rng: np.random.Generator
 ) -> _Sample:
     """Draw a subsample of the remaining points, and hypotheses around random points of it."""
-    from scipy.spatial import cKDTree
-
     if len(remaining) > SAMPLE_SIZE:
         indices = remaining[rng.integers(0, len(remaining), SAMPLE_SIZE)]
         indices = np.unique(indices)
@@ -118,13 +117,10 @@ def _draw(
         indices = remaining
     points = x[indices]
     count = min(HYPOTHESES, 4 * len(points))
-    seeds = rng.integers(0, len(points), count)
-    widest = min(NEIGHBOURHOODS[-1], len(points))
-    _, neighbours = cKDTree(points).query(points[seeds], k=widest)
-    # Hypothesis h takes its points from the first NEIGHBOURHOODS[h mod 4] neighbours.
-    reach = np.minimum(np.array(NEIGHBOURHOODS)[np.arange(count) % len(NEIGHBOURHOODS)], widest)
-    picks = (rng.random((count, POINTS_PER_HYPOTHESIS)) * reach[:, None]).astype(np.int64)
-    chosen = points[np.take_along_axis(neighbours, picks, axis=1)]
+    thinned = points[rng.random(len(points)) < 1.0 / THINNED]
+    chosen = _neighbourhoods(points, count // 2, rng)
+    if len(thinned) >= POINTS_PER_HYPOTHESIS:
+        chosen = np.concatenate([chosen, _neighbourhoods(thinned, count // 2, rng)])
     planes, thickness, flat = _local_planes(chosen)
     if from_sensor:
         flat &= np.abs(planes[:, 3]) > EDGE_ON * np.linalg.norm(chosen.mean(axis=1), axis=1)
@@ -134,6 +130,18 @@ def _draw(
     distance = points @ planes[:, :3].astype(np.float32).T - planes[:, 3].astype(np.float32)
     near = (np.abs(distance) < np.float32(GATE_SIGMAS * sigma_m)).astype(np.float32)
     return _Sample(indices, points, planes, near, sigma_m)
+
+
+def _neighbourhoods(points: Float32Array, count: int, rng: np.random.Generator) -> Float32Array:
+    """Points (count, K, 3) drawn from the nearest ones of random points, by turns from more and from fewer of them."""
+    from scipy.spatial import cKDTree
+
+    seeds = rng.integers(0, len(points), count)
+    widest = min(NEIGHBOURHOODS[-1], len(points))
+    _, neighbours = cKDTree(points).query(points[seeds], k=widest)
+    reach = np.minimum(np.array(NEIGHBOURHOODS)[np.arange(count) % len(NEIGHBOURHOODS)], widest)
+    picks = (rng.random((count, POINTS_PER_HYPOTHESIS)) * reach[:, None]).astype(np.int64)
+    return np.asarray(points[np.take_along_axis(neighbours, picks, axis=1)])
 
 
 def _local_planes(chosen: Float32Array) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -227,9 +235,11 @@ class _Raster:
 
     def cells(self, points: NDArray[np.floating]) -> IntArray:
         """Cells (M,) of points (M, 3) as flat numbers; -1 outside."""
-        uv = np.floor(points @ (self.axes.T / self.cell_m).astype(points.dtype)).astype(np.int64) - self.origin
-        inside = (uv >= 0).all(axis=1) & (uv < self.shape).all(axis=1)
-        return np.where(inside, uv[:, 0] * self.shape[1] + uv[:, 1], -1)
+        scaled = (self.axes / self.cell_m).astype(points.dtype) @ points.T
+        u = np.floor(scaled[0]).astype(np.int64) - self.origin[0]
+        v = np.floor(scaled[1]).astype(np.int64) - self.origin[1]
+        inside = (u >= 0) & (u < self.shape[0]) & (v >= 0) & (v < self.shape[1])
+        return np.where(inside, u * self.shape[1] + v, -1)
 
 
 def _raster(points: NDArray[np.floating], plane: Plane, cell_m: float, border: int) -> _Raster:
@@ -286,34 +296,53 @@ def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, comp
     occupied = np.zeros(raster.shape[0] * raster.shape[1] + 1, dtype=bool)
     occupied[raster.cells(seen)] = True
     allowed = np.append(_grown(occupied[:-1].reshape(raster.shape)).ravel(), False)
-    sigma_m = sample.sigma_m
-    reach = np.float32(WIDEST * GATE_SIGMAS * sigma_m)
+    reach = np.float32(WIDEST * GATE_SIGMAS * sample.sigma_m)
     distance = x @ plane.normal.astype(np.float32) - np.float32(plane.offset)
     near = np.flatnonzero((np.abs(distance) < reach) & free)
-    near = near[allowed[raster.cells(x[near])]]
-    chosen = near
-    for _ in range(3):
-        distance = x[near] @ plane.normal.astype(np.float32) - np.float32(plane.offset)
-        chosen = near[np.abs(distance) < GATE_SIGMAS * sigma_m]
-        if len(chosen) < 6:
-            return None
-        plane = _moment_plane(x[chosen])
-        residual = x[chosen] @ plane.normal.astype(np.float32) - np.float32(plane.offset)
-        sigma_m = min(
-            max(mad_sigma(residual, centred=True), MIN_SIGMA_M, 0.5 * sample.sigma_m), WIDEST * sample.sigma_m
-        )
-    # A plane stands out from what is around it: a slab through scattered clutter does not.
-    distance = x[near] @ plane.normal.astype(np.float32) - np.float32(plane.offset)
-    around = int(np.count_nonzero(np.abs(distance) < 2.0 * GATE_SIGMAS * sigma_m))
-    if len(chosen) < 0.6 * around or not _is_thin(x[chosen], sigma_m):
+    local = x[near]
+    keep = allowed[raster.cells(local)]
+    near, local = near[keep], local[keep]
+    if len(near) < 6:
         return None
-    return PlanePatch(plane, chosen, sigma_m)
+    centre = seen.mean(axis=0, dtype=np.float64)
+    local = local - centre.astype(np.float32)
+    sigma_m, normal, offset = sample.sigma_m, plane.normal, plane.offset - float(plane.normal @ centre)
+    for _ in range(3):
+        distance = local @ normal.astype(np.float32) - np.float32(offset)
+        inside = np.abs(distance) < GATE_SIGMAS * sigma_m
+        if np.count_nonzero(inside) < 6:
+            return None
+        normal, offset, variances = _moments(local, inside)
+        sigma_m = _spread(distance[inside], sample.sigma_m)
+    # A plane stands out from what is around it: a slab through scattered clutter does not.
+    around = int(np.count_nonzero(np.abs(distance) < 2.0 * GATE_SIGMAS * sigma_m))
+    if np.count_nonzero(inside) < 0.6 * around or not _is_thin(variances, sigma_m):
+        return None
+    offset += float(normal @ centre)
+    final = Plane(normal, offset) if offset <= 0.0 else Plane(-normal, -offset)
+    return PlanePatch(final, near[inside], sigma_m)
 
 
-def _is_thin(points: Float32Array, sigma_m: float) -> bool:
-    """Whether points (M, 3) extend both ways well beyond their spread across."""
-    variance = np.linalg.eigvalsh(np.cov(points.T.astype(np.float64)))
-    return bool(sigma_m**2 < 0.35**2 * variance[1] and sigma_m**2 < 0.1**2 * variance[2])
+def _moments(local: Float32Array, inside: BoolArray) -> tuple[FloatArray, float, FloatArray]:
+    """Normal, offset and variances (3,), ascending, of the points (M, 3) that are inside; near the origin, so that
+    single precision holds their moments."""
+    weight = inside.astype(np.float32)
+    count = float(np.count_nonzero(inside))
+    mean = (weight @ local).astype(np.float64) / count
+    second = ((local * weight[:, None]).T @ local).astype(np.float64) / count - np.outer(mean, mean)
+    variances, axes = np.linalg.eigh(second)
+    return axes[:, 0], float(axes[:, 0] @ mean), variances
+
+
+def _spread(distance: Float32Array, first_sigma_m: float) -> float:
+    """Robust spread of distances (M,) across a plane, within a factor of the subsample's."""
+    few = distance[:: max(len(distance) // 20_000, 1)]
+    return min(max(mad_sigma(few, centred=True), MIN_SIGMA_M, 0.5 * first_sigma_m), WIDEST * first_sigma_m)
+
+
+def _is_thin(variances: FloatArray, sigma_m: float) -> bool:
+    """Whether points with these variances extend both ways well beyond their spread across."""
+    return bool(sigma_m**2 < 0.35**2 * variances[1] and sigma_m**2 < 0.1**2 * variances[2])
 
 
 def _grown(occupied: BoolArray) -> BoolArray:

@@ -22,14 +22,15 @@ MIN_VOLUME = 0.12
 MIN_FACE_POINTS = 12
 # Share of a face's points that have to lie on the right side of the other two.
 ONE_SIDED = 0.9
+OUTLINE_DIRECTIONS = 64
 
 
-@dataclass(frozen=True, eq=False)
-class _Local:
-    """A patch's points within reach of a corner."""
+class _Surface:
+    """A patch with its points (M, 3) and their bounding box."""
 
-    points: FloatArray
-    plane: Plane
+    def __init__(self, patch: PlanePatch, points: FloatArray) -> None:
+        self.patch, self.points = patch, points
+        self.low, self.high = points.min(axis=0), points.max(axis=0)
 
 
 def find_corners(
@@ -48,39 +49,39 @@ def find_corners(
     """
     if len(patches) < 3:
         return ()
-    triples, corners = _meeting_triples(points, patches)
+    surfaces = [_Surface(p, points[p.indices].astype(np.float64)) for p in patches]
+    triples, corners = _meeting_triples(surfaces)
     if near is not None:
         close = np.linalg.norm(corners - near, axis=1) <= radius_m
         triples, corners = triples[close], corners[close]
-    found = [c for t, corner in zip(triples, corners, strict=True) if (c := _candidate(points, patches, t, corner))]
+    found = [c for t, corner in zip(triples, corners, strict=True) if (c := _candidate(surfaces, t, corner))]
     return _without_doubles(sorted(found, key=lambda c: -c.support))
 
 
-def _meeting_triples(points: NDArray[np.floating], patches: tuple[PlanePatch, ...]) -> tuple[IntArray, FloatArray]:
+def _meeting_triples(surfaces: list[_Surface]) -> tuple[IntArray, FloatArray]:
     """Triples (T, 3) of patches whose common point (T, 3) lies in the neighbourhood of all three."""
-    normals = np.stack([p.plane.normal for p in patches])
-    offsets = np.array([p.plane.offset for p in patches])
-    triples = np.array(list(combinations(range(len(patches)), 3)))
+    normals = np.stack([s.patch.plane.normal for s in surfaces])
+    offsets = np.array([s.patch.plane.offset for s in surfaces])
+    triples = np.array(list(combinations(range(len(surfaces)), 3)))
     systems = normals[triples]
     good = np.abs(np.linalg.det(systems)) > MIN_VOLUME
     triples, systems = triples[good], systems[good]
     if len(triples) == 0:
         return triples, np.zeros((0, 3))
     corners = np.linalg.solve(systems, offsets[triples][..., None])[..., 0]
-    low = np.stack([points[p.indices].min(axis=0) for p in patches]) - MAX_MISSING_M
-    high = np.stack([points[p.indices].max(axis=0) for p in patches]) + MAX_MISSING_M
+    low = np.stack([s.low for s in surfaces]) - MAX_MISSING_M
+    high = np.stack([s.high for s in surfaces]) + MAX_MISSING_M
     inside = (corners[:, None] > low[triples]).all(axis=(1, 2)) & (corners[:, None] < high[triples]).all(axis=(1, 2))
     return triples[inside], np.asarray(corners[inside])
 
 
-def _candidate(
-    points: NDArray[np.floating], patches: tuple[PlanePatch, ...], triple: IntArray, corner: FloatArray
-) -> CornerCandidate | None:
-    faces = [patches[k] for k in triple]
+def _candidate(surfaces: list[_Surface], triple: IntArray, corner: FloatArray) -> CornerCandidate | None:
+    faces = [surfaces[k].patch for k in triple]
     local = []
-    for face in faces:
-        around = points[face.indices].astype(np.float64)
-        distance = np.linalg.norm(around - corner, axis=1)
+    for k in triple:
+        around = surfaces[k].points
+        offset = around - corner
+        distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
         around = around[distance < REACH_M]
         if len(around) < MIN_FACE_POINTS or distance.min() > MAX_MISSING_M:
             return None
@@ -95,7 +96,7 @@ def _candidate(
     outlines = [_outline(p, f.plane) for p, f in zip(local, faces, strict=True)]
     if any(len(o) < 3 for o in outlines):
         return None
-    obstacles = _obstacles(points, patches, triple, local)
+    obstacles = _obstacles(surfaces, triple, local)
     return CornerCandidate(
         corner,
         np.stack([f.plane.normal for f in faces]),
@@ -150,46 +151,33 @@ def _within_common_reach(points: FloatArray, local: list[FloatArray], corner: Fl
 
 
 def _outline(points: FloatArray, plane: Plane) -> FloatArray:
-    """The convex outline (K, 3) of points on a plane, counter-clockwise seen from the normal's side."""
+    """The convex outline (K, 3) of points on a plane, counter-clockwise seen from the normal's side.
+
+    Its vertices are the points farthest out in `OUTLINE_DIRECTIONS` directions.
+    """
     u, v = perpendicular_pair(plane.normal)
     flat = np.column_stack([points @ u, points @ v])
-    order = np.lexsort((flat[:, 1], flat[:, 0]))
-    lower = _half_hull(flat, order)
-    upper = _half_hull(flat, order[::-1])
-    return plane.project(points[lower[:-1] + upper[:-1]])
+    angle = np.linspace(0.0, 2.0 * np.pi, OUTLINE_DIRECTIONS, endpoint=False)
+    farthest = np.argmax(flat @ np.stack([np.cos(angle), np.sin(angle)]), axis=0)
+    corners = farthest[farthest != np.roll(farthest, 1)]
+    return plane.project(points[corners])
 
 
-def _half_hull(flat: FloatArray, order: IntArray) -> list[int]:
-    """Andrew's monotone chain."""
-    hull: list[int] = []
-    for k in order:
-        while len(hull) >= 2:
-            a, b, c = flat[hull[-2]], flat[hull[-1]], flat[k]
-            if (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) > 0.0:
-                break
-            hull.pop()
-        hull.append(int(k))
-    return hull
-
-
-def _obstacles(
-    points: NDArray[np.floating], patches: tuple[PlanePatch, ...], triple: IntArray, local: list[FloatArray]
-) -> tuple[Plane, ...]:
+def _obstacles(surfaces: list[_Surface], triple: IntArray, local: list[FloatArray]) -> tuple[Plane, ...]:
     """Planes of other patches that touch the faces: what a face's beam meets below the target's foot."""
     all_local = np.concatenate(local)
     low, high = all_local.min(axis=0) - 0.1, all_local.max(axis=0) + 0.1
     found = []
-    for k, patch in enumerate(patches):
-        if k in triple:
+    for k, surface in enumerate(surfaces):
+        if k in triple or (surface.low > high).any() or (surface.high < low).any():
             continue
-        theirs = points[patch.indices]
-        theirs = theirs[((theirs > low) & (theirs < high)).all(axis=1)]
-        if len(theirs) < 20:
+        theirs = surface.points
+        if np.count_nonzero(((theirs > low) & (theirs < high)).all(axis=1)) < 20:
             continue
-        height = patch.plane.distance(all_local)
+        height = surface.patch.plane.distance(all_local)
         # It borders the target only if the target stands wholly on its free side, and close to it.
-        if np.mean(height > -3.0 * patch.sigma_m) > 0.97 and height.min() < 0.2:
-            found.append(patch.plane)
+        if np.mean(height > -3.0 * surface.patch.sigma_m) > 0.97 and height.min() < 0.2:
+            found.append(surface.patch.plane)
     return tuple(found)
 
 
