@@ -31,8 +31,8 @@ THINNED = 4
 POINTS_PER_HYPOTHESIS = 10
 GATE_SIGMAS = 3.0
 MIN_SIGMA_M = 2e-4
-# A real wall or floor is less flat than its neighbourhoods say, by up to this factor.
-WIDEST = 5.0
+# A patch spreads more than its neighbourhoods say, by up to this factor; a wider slab would take in two surfaces.
+WIDEST = 3.0
 # A patch is connected across gaps of this share of its range, which spans the lines of a 16-beam LiDAR on a slope.
 GAP_PER_RANGE = 0.06
 MIN_GAP_M = 0.04

@@ -13,6 +13,7 @@ from lidarpose.model.corner_result import CornerCandidate
 THRESHOLD_M = 0.01
 SAMPLES = 300
 CLEARANCE = 2.5
+REFITS = 4
 GROUND_CLEARANCE_M = 0.04
 MIN_POINTS = 12
 SCREENING_RAD = np.radians(20.0)
@@ -55,11 +56,35 @@ def ransac_corner(points: FloatArray, sighting: CornerCandidate, *, seed: int, s
             return None
         # What the noise put just outside the slab is still of this plane, and no second one.
         remaining = remaining[np.abs(planes[-1].distance(remaining)) > CLEARANCE * THRESHOLD_M]
+    if screening:
+        planes = _apart(region, planes)
     try:
         corner = intersect_three_planes((planes[0], planes[1], planes[2]))
     except ValueError:
         return None
     return corner if np.linalg.norm(corner - sighting.corner) < 0.3 else None
+
+
+def _apart(points: FloatArray, planes: list[Plane]) -> list[Plane]:
+    """The planes fitted again without the points next to an edge, which are within the threshold of two of them."""
+    for _ in range(REFITS):
+        distance = np.abs(np.stack([plane.distance(points) for plane in planes]))
+        fitted = []
+        for k, plane in enumerate(planes):
+            others = np.delete(distance, k, axis=0).min(axis=0)
+            chosen = (distance[k] < THRESHOLD_M) & (others > CLEARANCE * THRESHOLD_M)
+            fitted.append(_refitted(points[chosen], plane))
+        planes = fitted
+    return planes
+
+
+def _refitted(points: FloatArray, plane: Plane) -> Plane:
+    if len(points) < MIN_POINTS:
+        return plane
+    try:
+        return fit_plane(points)
+    except ValueError:
+        return plane
 
 
 def _best_sample(points: FloatArray, rng: np.random.Generator) -> FloatArray:

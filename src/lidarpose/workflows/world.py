@@ -57,6 +57,33 @@ MIN_FRAMES_FOR_BOX_PLOT = 5
 CONVINCING_GAIN = 9.0
 
 
+@dataclass(frozen=True, eq=False)
+class LocatedTarget:
+    """The target's sightings, and its surroundings cut from all frames."""
+
+    found: FoundTarget
+    crops: tuple[PlaceCrop, ...]
+
+
+def locate_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: None) -> LocatedTarget:
+    """Find the target at all places and cut it from all frames.
+
+    Raises
+    ------
+    InputError
+        If a cloud cannot be read.
+    UndeterminedError
+        If no corner, or more than one, moves as the world coordinates say.
+    """
+    found = find_target(session, seed=seed, tick=tick)
+    if found.ambiguous:
+        raise UndeterminedError(
+            "more than one corner of the scene moves as the world coordinates say",
+            remedy="Tell which is the target's by near_x_m,near_y_m,near_z_m in the table of positions.",
+        )
+    return LocatedTarget(found, gather(session, found, tick=tick))
+
+
 def calibrate_world(
     session: CornerSession,
     method: WorldMethod = "joint",
@@ -65,6 +92,7 @@ def calibrate_world(
     wishes: Mapping[str, float] | None = None,
     seed: int = 0,
     provenance: Mapping[str, Any] | None = None,
+    located: LocatedTarget | None = None,
     tick: Tick = lambda: None,
 ) -> WorldCalibration:
     """The calibration of `world_run`, for those who need no more."""
@@ -75,6 +103,7 @@ def calibrate_world(
         wishes=wishes,
         seed=seed,
         provenance=provenance,
+        located=located,
         tick=tick,
     )
     return run.calibration
@@ -88,6 +117,7 @@ def world_run(
     wishes: Mapping[str, float] | None = None,
     seed: int = 0,
     provenance: Mapping[str, Any] | None = None,
+    located: LocatedTarget | None = None,
     tick: Tick = lambda: None,
 ) -> WorldRun:
     """The pose of the clouds' frame in the world, with what a reader needs to see to judge it.
@@ -106,6 +136,8 @@ def world_run(
         `want_mm` and `want_deg`, standard deviations that are good enough.
     provenance
         What to record of the run in the calibration, beside method and counts.
+    located
+        What `locate_target` found, to spare the search where several methods are tried on one session.
     tick
         Called once for each frame read or searched.
 
@@ -118,13 +150,8 @@ def world_run(
     """
     scale_too = session.estimate_scale if estimate_scale is None else estimate_scale
     session = replace(session, estimate_scale=scale_too)
-    found = find_target(session, seed=seed, tick=tick)
-    if found.ambiguous:
-        raise UndeterminedError(
-            "more than one corner of the scene moves as the world coordinates say",
-            remedy="Tell which is the target's by near_x_m,near_y_m,near_z_m in the table of positions.",
-        )
-    crops = gather(session, found, tick=tick)
+    located = located or locate_target(session, seed=seed, tick=tick)
+    found, crops = located.found, located.crops
     limits = PrecisionLimits(**(wishes or {}))
     if method == "joint":
         run = _joint(session, found, crops, scale_too, limits)
