@@ -62,7 +62,7 @@ def scan(
     from lidarpose.storage.calibration import read_turntable_calibration, read_world_calibration
     from lidarpose.storage.clouds import open_cloud_writer
     from lidarpose.storage.recording import read_recording, release_pages
-    from lidarpose.workflows.scanning import ScanOptions, assemble_scan
+    from lidarpose.workflows.scanning import POINTS_PER_PART, ScanOptions, assemble_scan
 
     _check_gate(nearest_m, farthest_m)
     sweeps = read_recording(recording)
@@ -80,7 +80,7 @@ def scan(
             writer.append(cloud)
             points += len(cloud)
             release_pages(sweeps)
-            step = min(1 << 20, sweeps.range_m.size - done)
+            step = min(POINTS_PER_PART, sweeps.range_m.size - done)
             done += step
             advance(step)
     frame = "camera" if world is None else "world"

@@ -86,7 +86,7 @@ def assemble(
     if points.shape != shape or not points.flags.c_contiguous:
         raise ValueError(f"out has shape {points.shape}, expected C-ordered {shape}")
     if compiled is None:
-        compiled = recording.range_m.size >= COMPILED_FROM_POINTS and has_compiler()
+        compiled = pays_to_compile(recording)
     block = _block_per_beam if recording.has_reading_per_beam else _block_per_sweep
     if compiled:
         from lidarpose.measure import kernels
@@ -116,6 +116,11 @@ def readings_between(recording: SweepRecording, first: int = 0, last: int | None
     time = np.append(time, time[-1] + period)
     reading = np.append(reading, 2.0 * reading[-1] - reading[-2])
     return np.asarray(np.interp(beam_time, time, reading))
+
+
+def pays_to_compile(recording: SweepRecording) -> bool:
+    """True if numba is installed and the recording is so large that importing it pays."""
+    return recording.range_m.size >= COMPILED_FROM_POINTS and has_compiler()
 
 
 def has_compiler() -> bool:

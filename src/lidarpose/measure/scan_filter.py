@@ -14,6 +14,8 @@ _STEP_IN_SIGMA = 6.0
 
 def within_gate(recording: SweepRecording, nearest_m: float, farthest_m: float) -> BoolArray:
     """(N, M) beams with a return between the two ranges."""
+    if nearest_m <= 0.0 and farthest_m == np.inf:
+        return recording.has_return()
     r = np.asarray(recording.range_m)
     return recording.has_return() & (r >= nearest_m) & (r <= farthest_m)
 

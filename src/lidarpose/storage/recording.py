@@ -62,6 +62,7 @@ def read_recording(folder: Path) -> SweepRecording:
     _check_angles(folder / "beam_angle_deg.npy", recording.beam_angle_deg)
     _check_times(folder / "time_s.npy", recording.time_s)
     _check_ranges(folder / "range_m.npy", recording.range_m)
+    release_pages(recording)
     return recording
 
 
@@ -94,11 +95,15 @@ def release_pages(recording: SweepRecording) -> None:
     The maps stay valid: pages are read again when needed. Keeps the memory of a streaming pass bounded.
     """
     for array in (recording.range_m, recording.intensity, recording.turntable_angle_deg):
-        base: Any = array
-        while isinstance(base, np.ndarray):
-            base = base.base
-        if isinstance(base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
-            base.madvise(mmap.MADV_DONTNEED)
+        _release(array)
+
+
+def _release(array: RealArray | None) -> None:
+    base: Any = array
+    while isinstance(base, np.ndarray):
+        base = base.base
+    if isinstance(base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        base.madvise(mmap.MADV_DONTNEED)
 
 
 def _head_text(lidar: LidarSpec) -> str:
@@ -160,6 +165,7 @@ def _blocks(array: RealArray) -> Any:
     step = max(1, (1 << 21) // max(1, _product(array.shape[1:])))
     for first in range(0, len(array), step):
         yield first, np.asarray(array[first : first + step])
+        _release(array)
 
 
 def _check_angles(path: Path, array: RealArray) -> None:
@@ -183,8 +189,10 @@ def _check_times(path: Path, array: RealArray | None) -> None:
 
 def _check_ranges(path: Path, array: RealArray) -> None:
     """Refuse millimetres taken for metres, from a sample of the sweeps."""
-    step = max(1, len(array) * array.shape[1] // (1 << 20))
-    sample = np.asarray(array[::step], dtype=np.float64)
+    # Runs of neighbouring sweeps: single ones all over a large file would map all of it into memory.
+    run = max(1, (1 << 16) // array.shape[1])
+    starts = np.unique(np.linspace(0, max(0, len(array) - run), 16).astype(np.int64))
+    sample = np.concatenate([np.asarray(array[k : k + run], dtype=np.float64) for k in starts])
     valid = sample[(sample > 0.0) & np.isfinite(sample)]
     if valid.size and float(np.median(valid)) > _LARGEST_RANGE_M:
         raise InputError(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.measure.assemble import assemble, compact, readings_between
+from lidarpose.measure.assemble import assemble, compact, pays_to_compile, readings_between
 from lidarpose.measure.point_sigma import point_sigma, world_points
 from lidarpose.measure.scan_filter import mixed_pixels, within_gate
 from lidarpose.model.calibration import TurntableCalibration, WorldCalibration
@@ -17,6 +18,8 @@ from lidarpose.model.cloud import Cloud
 from lidarpose.model.recording import RealArray, SweepRecording
 from lidarpose.model.turntable import TurntableMotion
 
+POINTS_PER_PART = 1 << 18
+"""Points that are assembled at a time: few enough for the cache and for bounded memory, enough to keep both cores busy."""
 # Range noise where neither the recording nor the user names one, for filters only.
 _USUAL_RANGE_SIGMA_M = 0.005
 
@@ -67,7 +70,7 @@ def assemble_scan(
     options: ScanOptions | None = None,
     world: WorldCalibration | None = None,
     *,
-    points_per_part: int = 1 << 20,
+    points_per_part: int = POINTS_PER_PART,
 ) -> Iterator[Cloud]:
     """The cloud of a recording in parts, in the order of the sweeps: turntable paper, eq. (28).
 
@@ -89,10 +92,23 @@ def assemble_scan(
     if options.never_stops and not recording.has_reading_per_beam:
         require_times(recording)
     motion = _fold_in(calibration.motion, world)
-    for first, part in recording.parts(points_per_part):
+    compiled = pays_to_compile(recording)
+
+    def cloud(first: int, part: SweepRecording) -> Cloud:
         if options.never_stops and not recording.has_reading_per_beam:
             part = replace(part, turntable_angle_deg=readings_between(recording, first, first + part.sweeps))
-        yield _cloud(part, first, calibration, options, world, motion)
+        return _cloud(part, first, calibration, options, world, motion, compiled)
+
+    # One part is assembled while the one before is written.
+    with ThreadPoolExecutor(1) as ahead:
+        waiting: Future[Cloud] | None = None
+        for first, part in recording.parts(points_per_part):
+            following = ahead.submit(cloud, first, part)
+            if waiting is not None:
+                yield waiting.result()
+            waiting = following
+        if waiting is not None:
+            yield waiting.result()
 
 
 def require_times(recording: SweepRecording) -> None:
@@ -121,9 +137,10 @@ def _cloud(
     options: ScanOptions,
     world: WorldCalibration | None,
     motion: TurntableMotion | None,
+    compiled: bool,
 ) -> Cloud:
     in_camera = motion is None or (options.sigma and world is not None)
-    points = assemble(part, calibration.motion if motion is None or in_camera else motion)
+    points = assemble(part, calibration.motion if motion is None or in_camera else motion, compiled=compiled)
     columns: dict[str, RealArray] = {}
     if part.intensity is not None:
         columns["intensity"] = np.asarray(part.intensity)

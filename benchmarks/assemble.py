@@ -1,0 +1,144 @@
+"""Assembling against copying, and streaming to a PLY against writing the same bytes.
+
+    python -m benchmarks.assemble [--sweeps 6000] [--beams 3240] [--stream-points 100000000]
+
+Prints one JSON object. Each pair is interleaved and the medians are compared, as the machine may be shared. Memory is
+the largest resident set of a process that streams the whole recording.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from lidarpose.geometry.se3 import Pose
+from lidarpose.measure.assemble import assemble, has_compiler
+from lidarpose.model.calibration import TurntableCalibration
+from lidarpose.model.recording import SweepRecording
+from lidarpose.model.turntable import TurntableMotion
+from lidarpose.storage.calibration import write_calibration
+from lidarpose.storage.recording import write_recording
+
+MOTION = TurntableMotion(
+    Pose.exp([0.1, -0.2, 0.3, 0.4, 0.5, -0.6]),
+    Pose(Pose.exp([0.0, 0.0, 0.0, 0.3, 0.2, 0.1]).rotation, np.array([0.05, 0.0, 0.0])),
+)
+
+
+def recording(sweeps: int, beams: int) -> SweepRecording:
+    rng = np.random.default_rng(0)
+    ranges = np.tile(rng.uniform(0.5, 10.0, (min(64, sweeps), beams)).astype(np.float32), (-(-sweeps // 64), 1))[
+        :sweeps
+    ]
+    return SweepRecording("bench", np.arange(sweeps) * 0.01, np.linspace(-45.0, 225.0, beams), ranges)
+
+
+def seconds(work: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def in_memory(sweeps: int, beams: int, repeats: int) -> dict[str, Any]:
+    """Points a second of both ways and of a copy of the result."""
+    source = recording(sweeps, beams)
+    out = np.zeros((sweeps, beams, 3), dtype=np.float32)
+    copy = np.zeros_like(out)
+    ways: dict[str, Callable[[], Any]] = {
+        "copy": lambda: np.copyto(copy, out),
+        "numpy": lambda: assemble(source, MOTION, out=out, compiled=False),
+    }
+    first: float | None = None
+    if has_compiler():
+        first = seconds(lambda: assemble(source, MOTION, out=out, compiled=True))
+        ways["compiled"] = lambda: assemble(source, MOTION, out=out, compiled=True)
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(repeats):
+        for name, way in ways.items():
+            times[name].append(seconds(way))
+    millions = {name: sweeps * beams / median(t) / 1e6 for name, t in times.items()}
+    return {
+        "points": sweeps * beams,
+        "million_points_per_s": millions,
+        "ratio_to_copy": {name: rate / millions["copy"] for name, rate in millions.items()},
+        "first_compiled_call_s": first,
+    }
+
+
+def streamed(points: int, beams: int, repeats: int) -> dict[str, Any]:
+    """`lidarpose scan` to a PLY in processes of its own, against writing the same bytes; largest memory in MB."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        write_recording(root / "rec", recording(points // beams, beams))
+        write_calibration(root / "cal.json", TurntableCalibration(MOTION))
+        scan, raw, memory = [], [], 0.0
+        for _ in range(repeats):
+            scan.append(seconds(lambda: _run_scan(root)))
+            memory = max(memory, float((root / "memory").read_text()))
+            raw.append(seconds(lambda: _write_raw(root)))
+        return {
+            "points": points,
+            "scan_s": median(scan),
+            "raw_write_s": median(raw),
+            "ratio": median(scan) / median(raw),
+            "memory_mb": memory,
+        }
+
+
+_CHILD = """
+import sys
+from pathlib import Path
+from lidarpose.cli.main import run
+status = run(sys.argv[2:])
+# Of this process alone: the usage that the system reports starts at the parent's.
+peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+Path(sys.argv[1]).write_text(str(int(peak.split()[1]) / 1024))
+sys.exit(status)
+"""
+
+
+def _run_scan(root: Path) -> None:
+    arguments = ["scan", str(root / "rec"), str(root / "cal.json"), "-o", str(root / "cloud.ply")]
+    command = [sys.executable, "-c", _CHILD, str(root / "memory"), *arguments]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+def _write_raw(root: Path) -> None:
+    """The bytes of the cloud from memory to a new file, flushed to the disk as the scan's are."""
+    block = np.ones(12 << 20, dtype=np.uint8).data
+    size = (root / "cloud.ply").stat().st_size
+    with (root / "raw").open("wb") as file:
+        for start in range(0, size, len(block)):
+            file.write(block[: min(len(block), size - start)])
+        file.flush()
+        os.fsync(file.fileno())
+    (root / "raw").unlink()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sweeps", type=int, default=6000)
+    parser.add_argument("--beams", type=int, default=3240)
+    parser.add_argument("--stream-points", type=int, default=100_000_000)
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args()
+    result = {
+        "in_memory": in_memory(options.sweeps, options.beams, options.repeats),
+        "streamed": streamed(options.stream_points, options.beams, max(1, options.repeats // 2)),
+    }
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()
