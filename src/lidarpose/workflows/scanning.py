@@ -19,7 +19,7 @@ from lidarpose.model.recording import RealArray, SweepRecording
 from lidarpose.model.turntable import TurntableMotion
 
 POINTS_PER_PART = 1 << 18
-"""Points that are assembled at a time: few enough for the cache and for bounded memory, enough to keep both cores busy."""
+"""Points that are assembled at a time: few enough for the cache and for bounded memory."""
 # Range noise where neither the recording nor the user names one, for filters only.
 _USUAL_RANGE_SIGMA_M = 0.005
 
