@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test test-slow check format lock bench bench-quick clean
+.PHONY: setup demo test test-slow check format lock gallery bench bench-quick clean
 
 setup: $(STAMP)
 
@@ -33,6 +33,10 @@ test-slow: setup
 format: setup
 	$(BIN)/ruff check --fix src tests benchmarks
 	$(BIN)/ruff format src tests benchmarks
+
+# The pictures of docs/gallery.md and the README; needs Chromium.
+gallery: setup
+	$(BIN)/python docs/make_gallery.py
 
 # Needs uv on the path. The lock names versions and hashes, never an index.
 lock:

@@ -195,13 +195,13 @@ class Page:
         self._call("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
         self._settle()
 
-    def screenshot(self, clip: dict[str, float] | None = None) -> bytes:
-        """A PNG of the whole page, or of a part (x, y, width, height in CSS pixels)."""
+    def screenshot(self, clip: dict[str, float] | None = None, scale: float = 1.0) -> bytes:
+        """A PNG of the whole page, or of a part (x, y, width, height in CSS pixels), larger or smaller by `scale`."""
         if clip is None:
             size = self._call("Page.getLayoutMetrics")["cssContentSize"]
             clip = {"x": 0, "y": 0, "width": size["width"], "height": size["height"]}
         picture = self._call(
-            "Page.captureScreenshot", {"format": "png", "captureBeyondViewport": True, "clip": {**clip, "scale": 1}}
+            "Page.captureScreenshot", {"format": "png", "captureBeyondViewport": True, "clip": {**clip, "scale": scale}}
         )
         return base64.b64decode(picture["data"])
 

@@ -106,9 +106,7 @@ def tick_text(value: float, ticks: Sequence[float]) -> str:
     """A tick's number with as many decimals as the division needs, and a true minus sign."""
     steps = np.diff(sorted(ticks)) if len(ticks) > 1 else np.array([abs(value) or 1.0])
     decimals = max(0, -int(np.floor(np.log10(max(float(steps.min()), 1e-9)) + 1e-9)))
-    text = f"{value:.{min(decimals, 6)}f}"
-    if len(ticks) > 1 and max(map(abs, ticks)) / max(float(steps.min()), 1e-12) > 1e4:
-        text = f"{value:.4g}"
+    text = f"{value:.{min(decimals, 9)}f}"
     return text.replace("-", "\u2212") if float(text) else text.lstrip("-")
 
 
@@ -202,12 +200,6 @@ class Chart:
         if data:
             self.parts.append(el("path", d=data, class_=f"area {class_}"))
 
-    def rug(self, x: ArrayLike, class_: str) -> None:
-        """Short ticks at the foot of the chart."""
-        floor = self.inner[3]
-        data = "".join(f"M{u:.1f} {floor:.1f}v-7" for u in self.px(x))
-        self.parts.append(el("path", d=data, class_=f"line {class_}"))
-
     def level(self, y: float, class_: str, label: str = "", below: bool = False) -> None:
         """A horizontal line across the chart, with a label at its right end."""
         left, top, right, bottom = self.inner
@@ -233,11 +225,6 @@ class Chart:
         circle = np.stack([np.cos(turn), np.sin(turn)]) * np.sqrt(np.maximum(values, 0.0))[:, None] * sigmas
         outline = (vectors @ circle).T + np.asarray(centre)
         self.parts.append(el("path", d=path_data(*self._to_px(outline)) + "Z", class_=f"line {class_}"))
-
-    def text(
-        self, x: float, y: float, text: str, class_: str = "", anchor: Literal["start", "middle", "end"] = "start"
-    ) -> None:
-        self.text_px(float(self.px(x)), float(self.py(y)), text, class_, anchor)
 
     def text_px(
         self, u: float, v: float, text: str, class_: str = "", anchor: Literal["start", "middle", "end"] = "start"

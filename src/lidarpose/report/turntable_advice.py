@@ -21,6 +21,7 @@ _WHOLE_LINES: dict[Kind, float] = {"stripes": 0.4, "ranges": 0.003}
 _LEAST_ARC_DEG = 10.0
 _LEAST_PLACES = 6
 _MUCH_LEFT_OUT = 0.15
+_CONTRADICTS = "fit the motion of the other places"
 
 _EXTRA_STEPS = {
     "encoder_scale": "Check the turntable's unit and gear ratio: positions.csv wants its readings in degrees.",
@@ -29,6 +30,8 @@ _EXTRA_STEPS = {
     "that ranges are in metres.",
     "beam_angle_scale": "Check the beam angles in the scans: a rounded angular step (0.0833 for 1/12 degree) adds up.",
     "black_bias_m": "Ranges on black and white squares differ: print the black squares in grey.",
+    "centre_x_px": "Calibrate the camera anew, or take the camera.yaml that belongs to these images (cropped ones?).",
+    "centre_y_px": "Calibrate the camera anew, or take the camera.yaml that belongs to these images (cropped ones?).",
     "focal_scale": "Calibrate the camera anew at this focus, and check that camera.yaml has the size of these images.",
 }
 
@@ -105,9 +108,12 @@ def _extra_steps(estimate: TurntableEstimate) -> Iterator[str]:
     called = [e for e in estimate.extras if e.suggested and not e.estimated and e.observable]
     for extra in sorted(called, key=lambda e: -abs(e.value) / max(e.sigma, 1e-300))[:1]:
         step = _EXTRA_STEPS.get(extra.name)
-        if step:
-            option = extra.name.removesuffix("_m").replace("_", "-")
-            yield f"{step} If it cannot be mended, calibrate with --estimate {option}."
+        if not step:
+            continue
+        # A wrong principal point is no matter of the recording: it is not offered for estimation.
+        option = extra.name.removesuffix("_m").replace("_", "-")
+        can = not extra.name.endswith("_px")
+        yield f"{step} If it cannot be mended, calibrate with --estimate {option}." if can else step
 
 
 def _left_out_steps(run: TurntableRun) -> Iterator[str]:
@@ -117,6 +123,13 @@ def _left_out_steps(run: TurntableRun) -> Iterator[str]:
         reasons = Counter(item.reason for item in run.left_out)
         often = f" Most often: {reasons.most_common(1)[0][0]}." if reasons else ""
         yield f"{lost} of {plural(total, 'place')} could not be used, or only in part.{often} Mend that, record again."
+    apart = [item.what for item in run.left_out if _CONTRADICTS in item.reason]
+    if total and len(apart) > _MUCH_LEFT_OUT * total:
+        yield (
+            f"Compare positions.csv with what was recorded, from {apart[0]} to {apart[-1]}: a reading or a scan that "
+            "stands one row too low or too high does this. Calibrated as sessions of their own, the two parts show "
+            "which of them is sound."
+        )
 
 
 def _layout_steps(run: TurntableRun) -> Iterator[str]:

@@ -12,7 +12,7 @@ from lidarpose.report.markup import Markup
 from lidarpose.report.numbers import short
 from lidarpose.report.page import Size, figure, legend_key
 from lidarpose.report.svg import Axis, Chart, padded
-from lidarpose.report.turn_numbers import TurnNumbers, arc_deg
+from lidarpose.report.turn_numbers import TurnNumbers, arc_deg, uncertain_pose_of
 
 
 def turn_figures(run: TurntableRun, numbers: TurnNumbers, want: tuple[float | None, float | None]) -> list[Markup]:
@@ -45,6 +45,39 @@ def turn_figures(run: TurntableRun, numbers: TurnNumbers, want: tuple[float | No
             "direction; the ranges' own noise comes on top.",
             size="wide",
         ),
+    ]
+
+
+def ellipse_figures(run: TurntableRun) -> list[Markup]:
+    """Error ellipses of the LiDAR's centre along the camera's axes: in the arc, and elsewhere on the turn."""
+    uncertain = uncertain_pose_of(run)
+    if uncertain is None:
+        return []
+    low, high = arc_deg(run)
+    middle = 0.5 * (low + high)
+    shown = [
+        (words, 1e6 * uncertain(float(np.deg2rad(middle + turn))).centre_covariance(), class_)
+        for words, turn, class_ in (
+            ("middle of the arc", 0.0, "lidar"),
+            ("a quarter turn on", 90.0, "p1"),
+            ("half a turn on", 180.0, "p2"),
+        )
+    ]
+    legend = [legend_key("line", class_, words) for words, _, class_ in shown]
+    reach = 1.15 * float(np.sqrt(max(float(np.diag(covariance).max()) for _, covariance, _ in shown)))
+
+    def draw_plane(width: float, axes: tuple[int, int]) -> Markup:
+        names = ("x (right)", "y (down)", "z (forward)")
+        x, y = (Axis(f"camera's {names[k]}, mm", -reach, reach, reverse=k == 1) for k in axes)
+        chart = Chart(width, min(0.72 * width, 330.0), x, y, f"Error ellipses, {names[axes[1]]}", equal=True)
+        for _, covariance, class_ in shown:
+            chart.ellipse(np.zeros(2), covariance[np.ix_(axes, axes)], class_)
+        chart.points([0.0], [0.0], "ink", 2.0)
+        return chart.render()
+
+    return [
+        figure("The centre's error ellipse, from above", lambda width: draw_plane(width, (0, 2)), "", legend),
+        figure("The same as the camera looks", lambda width: draw_plane(width, (0, 1)), "", legend),
     ]
 
 

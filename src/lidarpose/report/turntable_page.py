@@ -108,9 +108,8 @@ def _say(run: TurntableRun, numbers: TurnNumbers | None) -> str:
     inside, around = numbers.worst(numbers.centre_mm)
     inside_deg, around_deg = numbers.worst(numbers.rotation_deg)
     low, high = arc_deg(run)
-    claim = (
-        "By its own figures the" if run.calibration.quality and run.calibration.quality.verdict == "rejected" else "The"
-    )
+    sure = run.calibration.quality is not None and run.calibration.quality.verdict == "good"
+    claim = "The" if sure else "By its own figures the"
     return (
         f"{claim} LiDAR's centre is known to {short(inside)} mm and its orientation to {short(inside_deg)}° within the "
         f"recorded arc ({fixed(low, 1)}° to {fixed(high, 1)}°), and to {short(around)} mm and {short(around_deg)}° "
@@ -232,6 +231,7 @@ def _certainty_sections(run: TurntableRun, numbers: TurnNumbers | None) -> Itera
         "How sure, over the turn",
         lead,
         *certainty.turn_figures(run, numbers, wished(run)),
+        *certainty.ellipse_figures(run),
         card("In numbers", _table(numbers)),
     )
     if run.estimate is not None and run.estimate.directions:
@@ -296,12 +296,12 @@ def _extras(estimate: TurntableEstimate) -> Iterator[Markup]:
         return
     rows = []
     for e in shown:
-        length = e.name.endswith("_m")
-        scale, unit = (1e3, "mm") if length else (100.0, "%")
+        suffix = e.name.rsplit("_", 1)[-1]
+        scale, unit = {"m": (1e3, "mm"), "px": (1.0, "px")}.get(suffix, (100.0, "%"))
         state = "estimated" if e.estimated else "called for by the residuals" if e.suggested else "tested, not needed"
         rows.append(
             (
-                e.name.removesuffix("_m").replace("_", " "),
+                e.name.removesuffix("_m").removesuffix("_px").replace("_", " "),
                 f"{short(scale * e.value)} {unit}",
                 f"±{short(scale * e.sigma)} {unit}",
                 f"{state}. {e.note}" if e.note else state,

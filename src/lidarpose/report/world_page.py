@@ -98,8 +98,8 @@ def _say(run: WorldRun) -> str:
     sigmas = _sigmas(run)
     if sigmas is None:
         return "How sure the pose is, is not known."
-    rejected = run.calibration.quality is not None and run.calibration.quality.verdict == "rejected"
-    claim = "By its own figures the" if rejected else "The"
+    sure = run.calibration.quality is not None and run.calibration.quality.verdict == "good"
+    claim = "The" if sure else "By its own figures the"
     sensor = "LiDAR's centre" if run.calibration.source == "lidar" else "camera's centre"
     return (
         f"{claim} {sensor} is known to {short(sigmas[0])} mm in the world and its orientation to {short(sigmas[1])}°, "

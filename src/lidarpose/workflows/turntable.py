@@ -31,6 +31,10 @@ Step = Callable[[], None]
 """Called after each image or scan that is done, for a progress bar."""
 
 
+MOST_CONTRADICTING = 0.15
+"""Share of the places with both stripes that may contradict the others before the whole is in doubt."""
+
+
 @dataclass(frozen=True)
 class DetectedFeatures:
     """What detection found in a session, before anything is assigned.
@@ -96,6 +100,7 @@ def calibrate_turntable(
     else:
         calibration = TurntableCalibration(paper.motion, quality=paper_quality(paper), provenance=provenance or {})
         left_out = paper.left_out
+    calibration = replace(calibration, quality=doubted(calibration.quality, features, observations))
     return TurntableRun(
         method=method,
         session=session,
@@ -108,6 +113,25 @@ def calibrate_turntable(
         left_out=merge_left_out(observations.left_out, left_out),
         notes=features.notes,
     )
+
+
+def doubted(quality: Quality | None, features: DetectedFeatures, observations: TurntableObservations) -> Quality | None:
+    """The verdict, lowered to doubtful where many places with both stripes contradict the motion of the others.
+
+    Such places never reach the estimate, which is then sure of the rest; but if a part of a session fits one motion
+    and another part a different one, nothing says which of them is right.
+    """
+    kept = {place.position for place in observations.places}
+    lit = [place.position for place in features.places if len(place.stripes) == 2]
+    gone = [position for position in lit if position not in kept]
+    if quality is None or quality.verdict == "rejected" or len(gone) <= max(1.0, MOST_CONTRADICTING * len(lit)):
+        return quality
+    reason = (
+        f"{len(gone)} of {len(lit)} places (first {gone[0]}, last {gone[-1]}) show both stripes, but their scans do "
+        "not fit the motion of the other places: readings, scans or images may be mixed up, or something moved in "
+        "between"
+    )
+    return replace(quality, verdict="doubtful", reasons=(*quality.reasons, reason))
 
 
 def detect_features(session: TurntableSession, *, step: Step | None = None) -> DetectedFeatures:
