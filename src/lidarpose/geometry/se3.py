@@ -21,12 +21,16 @@ from lidarpose.geometry.arrays import FloatArray, as_float_array
 _SMALL_ANGLE = 1e-2
 
 
+_IDENTITY = np.eye(3)
+
+
 def skew(v: ArrayLike) -> FloatArray:
     """Cross-product matrices: (..., 3) -> (..., 3, 3) with ``skew(v) @ w == cross(v, w)``."""
-    x, y, z = np.moveaxis(np.asarray(v, dtype=np.float64), -1, 0)
-    zero = np.zeros_like(x)
-    rows = [np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)]
-    return np.stack(rows, -2)
+    w = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*w.shape, 3))
+    out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
+    out[..., 1, 2], out[..., 2, 0], out[..., 0, 1] = -w[..., 0], -w[..., 1], -w[..., 2]
+    return out
 
 
 def _sine_terms(angle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -106,14 +110,24 @@ def nearest_rotation(matrix: ArrayLike) -> FloatArray:
 def rotation_z(angle_rad: ArrayLike) -> FloatArray:
     """Rz(angle): right-handed rotations (..., 3, 3) about z by angles (...)."""
     angle = np.asarray(angle_rad, dtype=np.float64)
-    c, s, o, i = np.cos(angle), np.sin(angle), np.zeros_like(angle), np.ones_like(angle)
-    return np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, i], -1)], -2)
+    out = np.zeros((*angle.shape, 3, 3))
+    out[..., 0, 0] = out[..., 1, 1] = np.cos(angle)
+    out[..., 1, 0] = np.sin(angle)
+    out[..., 0, 1] = -out[..., 1, 0]
+    out[..., 2, 2] = 1.0
+    return out
 
 
 def _left_jacobian(w: FloatArray) -> FloatArray:
     _, b, c = _sine_terms(np.linalg.norm(w, axis=-1))
     W = skew(w)
     return np.asarray(np.eye(3) + b[..., None, None] * W + c[..., None, None] * (W @ W))
+
+
+def _determinant(R: FloatArray) -> float:
+    """Of a 3x3 matrix, without the detour through LAPACK."""
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,11 +153,21 @@ class Pose:
     def __post_init__(self) -> None:
         object.__setattr__(self, "rotation", as_float_array(self.rotation, (3, 3), "rotation"))
         object.__setattr__(self, "translation", as_float_array(self.translation, (3,), "translation"))
-        if not (np.all(np.isfinite(self.rotation)) and np.all(np.isfinite(self.translation))):
+        if not (np.isfinite(self.rotation).all() and np.isfinite(self.translation).all()):
             raise ValueError("a pose must be finite")
-        error = np.abs(self.rotation @ self.rotation.T - np.eye(3)).max()
-        if error > 1e-6 or np.linalg.det(self.rotation) < 0.0:
+        error = np.abs(self.rotation @ self.rotation.T - _IDENTITY).max()
+        if error > 1e-6 or _determinant(self.rotation) < 0.0:
             raise ValueError(f"not a proper rotation: R R^T differs from the identity by {error:.1e}")
+
+    @staticmethod
+    def _of_proper(rotation: FloatArray, translation: FloatArray) -> Pose:
+        """A pose made of proper rotations by multiplication: nothing to check, nothing to copy."""
+        pose = object.__new__(Pose)
+        rotation.setflags(write=False)
+        translation.setflags(write=False)
+        object.__setattr__(pose, "rotation", rotation)
+        object.__setattr__(pose, "translation", translation)
+        return pose
 
     @staticmethod
     def identity() -> Pose:
@@ -190,7 +214,8 @@ class Pose:
         return -q if q[3] < 0.0 else q
 
     def inverse(self) -> Pose:
-        return Pose(self.rotation.T, -self.rotation.T @ self.translation)
+        back = np.ascontiguousarray(self.rotation.T)
+        return Pose._of_proper(back, -(back @ self.translation))
 
     def adjoint(self) -> FloatArray:
         """Ad (6, 6): ``T @ Exp(xi) == Exp(Ad xi) @ T``."""
@@ -210,7 +235,8 @@ class Pose:
     def __matmul__(self, other: Pose | ArrayLike) -> Pose | FloatArray:
         """``T_a_b @ T_b_c`` composes; ``T_a_b @ points_b`` maps points (..., 3)."""
         if isinstance(other, Pose):
-            return Pose(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+            turned = self.rotation @ other.translation
+            return Pose._of_proper(self.rotation @ other.rotation, turned + self.translation)
         return self.rotate(other) + self.translation
 
     def minus(self, reference: Pose) -> FloatArray:
