@@ -1,5 +1,6 @@
 """Chessboards in rendered images: where they are, which is which, and whether the stated error is true."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -38,11 +39,40 @@ def test_a_board_that_moved_between_shots_is_named_with_its_shift(two_panels) ->
     assert "3.0" in found.notes[0]
 
 
-def test_an_image_without_boards_names_the_missing_panel() -> None:
-    noise = np.random.default_rng(3).integers(90, 110, (480, 640), dtype=np.uint8)
-    with pytest.raises(BoardNotFoundError, match="7 x 5 inner corners") as caught:
-        find_panels([noise], [Panel(7, 5, 0.02), Panel(7, 5, 0.02)])
+@pytest.mark.parametrize("low_high", [(90, 110), (0, 255), (0, 1), (255, 256)], ids=["grey", "noise", "black", "white"])
+def test_an_image_without_boards_names_the_missing_panel(low_high) -> None:
+    empty = np.random.default_rng(3).integers(*low_high, (480, 640)).astype(np.uint8)
+    with pytest.raises(BoardNotFoundError, match="7 x 5 inner corners; no chessboard was found at all") as caught:
+        find_panels([empty], [Panel(7, 5, 0.02), Panel(7, 5, 0.02)])
     assert caught.value.panel == 0
+
+
+@pytest.mark.parametrize("change", ["blur", "contrast", "over-exposure", "16 bit", "turn", "tilt"])
+def test_boards_are_found_in_poor_images_and_the_error_is_stated(two_panels, change) -> None:
+    rng = np.random.default_rng(5)
+    clean = two_panels.bright()
+    height, width = clean.shape
+    warp = np.eye(3)
+    if change == "blur":
+        clean = cv2.GaussianBlur(clean, (0, 0), 3.0)
+    elif change == "contrast":
+        clean = 90.0 + 0.15 * clean
+    elif change == "over-exposure":
+        clean = 1.6 * clean + 10.0
+    elif change == "turn":
+        warp[:2] = cv2.getRotationMatrix2D((width / 2, height / 2), 67.0, 0.7)
+    elif change == "tilt":
+        warp = np.array([[0.5, 0.0, 0.25 * width], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    image = two_panels.noisy(cv2.warpPerspective(clean, warp, (width, height), flags=cv2.INTER_CUBIC), rng)
+    if change == "16 bit":
+        image = image.astype(np.uint16) * 16
+    found = find_panels([image], [board.panel for board in two_panels.boards])
+    true = [cv2.perspectiveTransform(two_panels.project(b.corners_camera())[None], warp)[0] for b in two_panels.boards]
+    for corners in found.corners:
+        # A turn may exchange the panels: they are equal, and named by their places in the image.
+        truth = min(true, key=lambda pixels: np.linalg.norm((pixels - corners.pixels).mean(axis=0)))
+        distance = np.linalg.norm(corners.pixels[:, None] - truth[None], axis=-1).min(axis=1)
+        assert 0.6 < np.sqrt((distance**2).mean() / 2.0) / np.median(corners.sigma_px) < 1.5
 
 
 def test_a_board_of_another_size_is_named_not_taken(two_panels) -> None:

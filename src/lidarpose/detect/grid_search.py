@@ -23,6 +23,9 @@ _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CAL
 # Pixels of the longer side of the reduced image.
 _QUICK_SIDE = 900
 
+# Fewer corners than this in line may be anything.
+_LEAST_NAMED = 16
+
 
 @dataclass(frozen=True, eq=False)
 class GridSearch:
@@ -173,8 +176,9 @@ def _is_known(lattice: Lattice, found: Sequence[FloatArray | None]) -> bool:
 
 
 def _sizes(lattices: list[Lattice]) -> tuple[Size, ...]:
-    """Different sizes, most corners first, wider than high."""
-    large = sorted(lattices, key=lambda lattice: -len(lattice.grid))
+    """Different sizes of grids that are no accident of the background, most corners first, wider than high."""
+    whole = [x for x in lattices if len(x.grid) >= max(_LEAST_NAMED, 0.7 * x.size[0] * x.size[1])]
+    large = sorted(whole, key=lambda lattice: -len(lattice.grid))
     return tuple(dict.fromkeys((max(lattice.size), min(lattice.size)) for lattice in large))
 
 
@@ -218,7 +222,8 @@ def _detect(image: Image8, columns: int, rows: int) -> FloatArray | None:
         (_sector, small, factor),
     ]
     if factor < 1.0:
-        attempts += [(_classic, image, 1.0), (_sector, image, 1.0)]
+        # Not the classic detector at full size: it takes many seconds on an image without a board.
+        attempts.append((_sector, image, 1.0))
     for detector, scene, scale in attempts:
         corners = detector(scene, columns, rows)
         if corners is not None and is_a_grid(corners, columns, rows):

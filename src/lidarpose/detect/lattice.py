@@ -92,6 +92,8 @@ def _find_saddles(smooth: FloatArray, least_contrast: float) -> _Saddles:
 
 def ring_values(smooth: FloatArray, pixels: FloatArray, radius: float = _RING_RADIUS) -> FloatArray:
     """Values (N, samples) on circles around pixels (N, 2)."""
+    if len(pixels) == 0:
+        return np.zeros((0, _RING_SAMPLES))
     points = (pixels[:, None] + radius * _RING).astype(np.float32)
     values = cv2.remap(
         smooth, np.ascontiguousarray(points[..., 0]), np.ascontiguousarray(points[..., 1]), cv2.INTER_LINEAR
