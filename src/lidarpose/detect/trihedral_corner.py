@@ -204,38 +204,41 @@ class FaceMask:
     obstacles: tuple[Plane, ...]
     margin_m: float
 
-    def select(self, points: NDArray[np.floating], gate_m: float) -> tuple[IntArray, IntArray]:
-        """Indices (M,) of points (N, 3) on the faces, and the face of each; residual ranges within `gate_m`."""
-        x = points
-        radius = max(float(np.linalg.norm(o - self.corner, axis=1).max()) for o in self.outlines) + 0.1
-        offset = x - self.corner.astype(x.dtype)
-        close = np.flatnonzero(np.einsum("ij,ij->i", offset, offset) < radius * radius)
-        near = x[close].astype(np.float64)
-        ranges = np.linalg.norm(near, axis=1)
-        u = near / ranges[:, None]
-        face, predicted, step = self.meet(u)
-        good = (np.abs(ranges - predicted) < gate_m) & (step > 0.0)
-        close, u, face, predicted = close[good], u[good], face[good], predicted[good]
-        inside = self._inside(u * predicted[:, None], face)
-        return close[inside], face[inside]
+    def select(self, directions: FloatArray, range_m: FloatArray, gate_m: float) -> tuple[IntArray, IntArray]:
+        """Which returns are of the faces, and of which face each is.
 
-    def meet(self, directions: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-        """By direction (N, 3): the face met, the range there (inf if none), and by how far the next plane differs."""
-        slope = directions @ self.normals.T
+        Parameters
+        ----------
+        directions, range_m : (N, 3), (N,)
+            Unit beam directions and measured ranges.
+        gate_m
+            Returns farther than this from the range where their beam should end are something else.
+
+        Returns
+        -------
+        Indices (M,), and the face (M,) of each: 0, 1 or 2.
+        """
+        face, predicted = self.meet(directions)
+        with np.errstate(invalid="ignore"):
+            chosen = np.flatnonzero(np.abs(range_m - predicted) < gate_m)
+        face, predicted = face[chosen], predicted[chosen]
+        inside = self._inside(directions[chosen] * predicted[:, None], face)
+        return chosen[inside], face[inside]
+
+    def meet(self, directions: FloatArray) -> tuple[IntArray, FloatArray]:
+        """By direction (N, 3): the face met, and the range there; inf where the beam meets none."""
+        slope = self.normals @ directions.T
         height = self.normals @ self.corner
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ranges = height / slope
         facing = slope < -0.02
         worst = -np.inf if self.convex else np.inf
-        ranges = np.where(facing, ranges, worst)
-        face = np.argmax(ranges, axis=1) if self.convex else np.argmin(ranges, axis=1)
-        ordered = np.sort(ranges, axis=1)
-        best = np.take_along_axis(ranges, face[:, None], axis=1)[:, 0]
-        step = ordered[:, 2] - ordered[:, 1] if self.convex else ordered[:, 1] - ordered[:, 0]
+        with np.errstate(divide="ignore"):
+            ranges = np.where(facing, height[:, None] / slope, worst)
+        face = np.argmax(ranges, axis=0) if self.convex else np.argmin(ranges, axis=0)
+        best = np.take_along_axis(ranges, face[None], axis=0)[0]
         if self.convex:
             # Whoever leaves one of a convex corner's planes behind never enters the solid.
-            best = np.where(facing.all(axis=1), best, np.inf)
-        return face.astype(np.int64), best, step
+            best = np.where(facing.all(axis=0), best, np.inf)
+        return face.astype(np.int64), best
 
     def _inside(self, on_face: FloatArray, face: IntArray) -> BoolArray:
         """Which predicted points (N, 3) lie in their face's outline, off its edges with others and off obstacles."""

@@ -184,7 +184,14 @@ class FreeCorner:
         return worst, total
 
 
-def fit_corner(faces: Mapping[int, FaceReturns], normals: FloatArray, corner: FloatArray, sigma_m: float) -> FreeCorner:
+def fit_corner(
+    faces: Mapping[int, FaceReturns],
+    normals: FloatArray,
+    corner: FloatArray,
+    sigma_m: float,
+    *,
+    tolerance_m: float = 1e-7,
+) -> FreeCorner:
     """Three free planes through one place's returns.
 
     Parameters
@@ -193,6 +200,8 @@ def fit_corner(faces: Mapping[int, FaceReturns], normals: FloatArray, corner: Fl
         Returns of all three faces.
     normals, corner, sigma_m
         Where to start.
+    tolerance_m
+        The last step of the corner.
 
     Raises
     ------
@@ -213,7 +222,7 @@ def fit_corner(faces: Mapping[int, FaceReturns], normals: FloatArray, corner: Fl
         shift = np.linalg.solve(tilted, [m[0] for m in moves])
         normals, corner = tilted, corner + shift
         sigma_m = max(mad_sigma(np.concatenate(residuals), centred=True), MIN_SIGMA_M)
-        if np.linalg.norm(shift) < 1e-7:
+        if np.linalg.norm(shift) < tolerance_m:
             break
     return FreeCorner(corner, normals, sigma_m, np.stack(tilts))
 
@@ -273,7 +282,7 @@ def fit_corner_model(
         state = _moved(state, delta, options)
         residuals = np.concatenate([f.residual for f in faces])
         sigma_m = max(mad_sigma(residuals, centred=True), MIN_SIGMA_M)
-        if np.linalg.norm(delta[:6]) < 1e-9 and step > 3:
+        if np.linalg.norm(delta[:6]) < 1e-8 and step > 2:
             break
     information, _, systems = _assemble(faces, state, world, sigma_m, options)
     residuals = np.concatenate([f.residual for f in faces])

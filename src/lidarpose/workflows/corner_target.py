@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.detect.trihedral_corner import FaceMask, find_corners
@@ -59,6 +61,16 @@ class PlaceCrop:
     points: FloatArray
     frame: IntArray
     frames: int
+
+    @cached_property
+    def range_m(self) -> FloatArray:
+        """(N,)"""
+        return np.asarray(np.sqrt(np.einsum("ij,ij->i", self.points, self.points)))
+
+    @cached_property
+    def directions(self) -> FloatArray:
+        """Unit beam directions (N, 3)."""
+        return np.asarray(self.points / self.range_m[:, None])
 
 
 def world_coordinates(session: CornerSession) -> FloatArray:
@@ -213,11 +225,9 @@ def gather(session: CornerSession, found: FoundTarget, *, tick: Tick = lambda: N
 
     def crop(task: tuple[CloudSource, FloatArray]) -> FloatArray:
         source, corner = task
-        points = load_points(source)
-        offset = points - corner.astype(points.dtype)
-        kept = points[np.einsum("ij,ij->i", offset, offset) < radius * radius]
+        kept = _around(source.load().points, corner, radius)
         tick()
-        return np.asarray(kept, dtype=np.float64)
+        return kept
 
     crops = []
     with ThreadPoolExecutor(2) as pool:
@@ -226,6 +236,14 @@ def gather(session: CornerSession, found: FoundTarget, *, tick: Tick = lambda: N
             frame = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
             crops.append(PlaceCrop(np.concatenate(parts), frame, len(parts)))
     return tuple(crops)
+
+
+def _around(points: NDArray[np.floating], centre: FloatArray, radius: float) -> FloatArray:
+    """Points (M, 3) within a radius: most fall out by their first coordinate alone, those without return too."""
+    with np.errstate(invalid="ignore"):
+        slab = points[np.flatnonzero(np.abs(points[:, 0] - points.dtype.type(centre[0])) < radius)].astype(np.float64)
+        offset = slab - centre
+        return np.asarray(slab[np.einsum("ij,ij->i", offset, offset) < radius * radius])
 
 
 def expected_corners(found: FoundTarget) -> FloatArray:
@@ -262,15 +280,13 @@ def select_faces(
     crop: PlaceCrop, mask: FaceMask, gate_m: float, sigma_m: float | None = None
 ) -> dict[int, FaceReturns]:
     """Each face's returns at a place; with the noise known, without the spots that are plainly something else."""
-    index, face = mask.select(crop.points, gate_m)
+    index, face = mask.select(crop.directions, crop.range_m, gate_m)
     faces = {}
     for j in range(3):
         mine = index[face == j]
         if len(mine) < MIN_FACE_RETURNS:
             continue
-        points = crop.points[mine]
-        ranges = np.linalg.norm(points, axis=1)
-        returns = FaceReturns(points / ranges[:, None], ranges, crop.frame[mine])
+        returns = FaceReturns(crop.directions[mine], crop.range_m[mine], crop.frame[mine])
         if sigma_m is not None:
             returns = _second_screening(returns, mask.normals[j], mask.corner, sigma_m)
         if len(returns) >= MIN_FACE_RETURNS:
@@ -307,7 +323,7 @@ def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> Fre
                 continue
             if len(faces) < 3:
                 return None
-            fit = fit_corner(faces, normals, corner, sigma_m)
+            fit = fit_corner(faces, normals, corner, sigma_m, tolerance_m=1e-5)
             corner, normals, sigma_m = fit.corner, fit.normals, fit.sigma_m
             gate_m = min(gate_m, max(GATE_SIGMAS * sigma_m, 0.002))
     except UndeterminedError:
@@ -350,7 +366,7 @@ def observe(
 
 def _trusted(faces: dict[int, FaceReturns], crop: PlaceCrop, mask: FaceMask, sigma_m: float) -> dict[int, FaceReturns]:
     """At a place where no whole corner was seen: only faces on which most beams end where they should."""
-    _, face = mask.select(crop.points, 0.5)
+    _, face = mask.select(crop.directions, crop.range_m, 0.5)
     kept = {
         j: f for j, f in faces.items() if len(f) > 0.6 * np.count_nonzero(face == j) and len(f) >= 3 * MIN_FACE_RETURNS
     }
