@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test test-slow check format lock gallery bench bench-quick clean
+.PHONY: setup demo test test-slow check format lock gallery bench bench-quick accuracy-world clean
 
 setup: $(STAMP)
 
@@ -29,6 +29,10 @@ test: check
 
 test-slow: setup
 	$(BIN)/pytest -n 2 --dist worksteal -m slow
+
+# The corner paper's tables again; an hour on two cores.
+accuracy-world: setup
+	$(BIN)/python benchmarks/accuracy_world.py --output docs/accuracy-world.md
 
 format: setup
 	$(BIN)/ruff check --fix src tests benchmarks
