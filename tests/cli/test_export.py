@@ -11,7 +11,7 @@ import pytest
 
 from lidarpose.cli.main import run
 from lidarpose.geometry.se3 import Pose
-from lidarpose.model.calibration import TurntableCalibration
+from lidarpose.model.calibration import Quality, TurntableCalibration
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.storage.calibration import write_calibration
 
@@ -33,6 +33,14 @@ def test_the_urdf_agrees_with_pose(calibration: Path, tmp_path: Path, capsys: py
         wanted = np.array(json.loads(capsys.readouterr().out)["matrix"])
         found = chain.forward_kinematics({"turntable_joint": np.deg2rad(angle_deg)})["lidar"].matrix()
         np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-9)
+
+
+def test_a_doubtful_calibration_is_exported_with_a_remark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    motion = TurntableMotion.from_any_frame(Pose.identity(), Pose.exp([0.05, 0, 0, 1, 0, 1]))
+    quality = Quality("doubtful", ("the arc is short",))
+    write_calibration(tmp_path / "c.json", TurntableCalibration(motion, quality=quality))
+    assert run(["export", str(tmp_path / "c.json"), "--to", "csv", "-o", str(tmp_path / "c.csv")]) == 0
+    assert "doubtful: the arc is short" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -64,3 +64,9 @@ def export(
         names=FrameNames(camera_frame, turntable_frame, lidar_frame, world_frame),
     )
     write_export(output, loaded, to, options)
+    if loaded.quality is not None and loaded.quality.verdict != "good":
+        from lidarpose.cli.console import err
+
+        reasons = "; ".join(loaded.quality.reasons)
+        text = f"Note: the verdict on this calibration is {loaded.quality.verdict}"
+        err().print(f"{text}: {reasons}" if reasons else f"{text}.", markup=False, soft_wrap=True)
