@@ -386,7 +386,8 @@ def test_text_in_the_ways_people_write_it(tmp_path: Path, text: str, names: set[
 
 
 @pytest.mark.parametrize(
-    "text", ["", "hello\n", "1 2\n", "1 2 3\n4 5\n", "1 2 3\n4 5 x\n", "# x y z\n", "\0\0\0", "a b c\n"]
+    "text",
+    ["", "hello\n", "1 2\n", "1 2 3\n4 5\n", "1 2 3\n4 5 x\n", "# x y z\n", "\0\0\0", "a b c\n", ",", ";;\n1 2 3\n"],
 )
 def test_text_that_is_no_cloud(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.xyz").write_text(text)

@@ -50,6 +50,8 @@ def _read_head(path: Path, file: IO[bytes]) -> tuple[list[str], str]:
         separator = next((mark for mark in ",;" if mark in text), " ")
         comment = text.startswith(("#", "//"))
         words = text.lstrip("#/ ").replace(separator, " ").split()
+        if not words and not comment:
+            raise InputError(path, f"{text[:60]!r} is no point", expected="lines of x y z")
         if not comment and _is_number(words[0]):
             break
         if comment and not {"x", "y", "z"} <= {_UNITS.sub("", word.lower()) for word in words}:
