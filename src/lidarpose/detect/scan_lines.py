@@ -35,7 +35,7 @@ LARGEST_DIRECTION_SIGMA_RAD = np.deg2rad(3.0)
 # sweeps leaves what they have in common. Where that shows (less than this share of the beams is explained, or lines are
 # in fragments), lines are looked for at these many times the noise, and averages count as the mean of no more than this
 # many sweeps.
-EXPLAINED = 0.9
+EXPLAINED = 0.8
 ROUGHNESS = (3.0, 6.0)
 # The second, wider look is for instruments whose squares' steps are many times their noise, not for noisy ones.
 LARGEST_STEP_M = 0.012
@@ -90,7 +90,7 @@ def find_lines(scan: Scan, spec: LidarSpec | None = None) -> tuple[ScanLine, ...
     segments, curved = _segments(beams, noise)
     for roughness in ROUGHNESS:
         too_wide = roughness > ROUGHNESS[0] and roughness * noise > LARGEST_STEP_M
-        if too_wide or not _fragmented(segments, curved, len(beams)):
+        if too_wide or not _fragmented(beams, noise, segments, curved):
             break
         coarse, _ = _segments(beams, roughness * noise)
         segments = _preferred(segments, coarse, curved)
@@ -106,12 +106,22 @@ def _segments(beams: Beams, noise: float) -> tuple[list[tuple[int, int]], list[t
     return _merged(beams, noise, _away_from_curves(segments, curved)), curved
 
 
-def _fragmented(segments: list[tuple[int, int]], curved: list[tuple[int, int]], beams: int) -> bool:
-    """Whether much of the scan lies in no line, or three lines follow each other without a step between them."""
-    if sum(last - first for first, last in (*segments, *curved)) < EXPLAINED * beams:
+def _fragmented(beams: Beams, noise: float, segments: list[tuple[int, int]], curved: list[tuple[int, int]]) -> bool:
+    """Whether much of the scan lies in no line, or four lines follow each other without a step between them."""
+    if sum(last - first for first, last in (*segments, *curved)) < EXPLAINED * len(beams):
         return True
-    touching = [b[0] - a[1] <= WINDOW for a, b in pairwise(segments)]
-    return any(a and b for a, b in pairwise(touching))
+    touching = [_touch(beams, noise, a, b) for a, b in pairwise(segments)]
+    return any(all(touching[k : k + 3]) for k in range(len(touching) - 2))
+
+
+def _touch(beams: Beams, noise: float, a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Whether one segment begins where the other ends, but for a few beams and a few sigma."""
+    gap = b[0] - a[1]
+    if gap > WINDOW:
+        return False
+    ends = _points(beams, *a)[[-WINDOW // 2, -1]], _points(beams, *b)[[0, WINDOW // 2]]
+    spacing = max(float(np.linalg.norm(e[1] - e[0])) for e in ends) / (WINDOW // 2)
+    return float(np.linalg.norm(ends[1][0] - ends[0][1])) < (abs(gap) + 2) * spacing + 8.0 * noise
 
 
 def _preferred(
@@ -408,10 +418,12 @@ def _finished(beams: Beams, noise: float, stated: float | None, segment: tuple[i
     for _ in range(5):
         # Rough ranges scatter by more than the noise, but never without bound.
         scale = min(max(1.0, mad_sigma(fit.residuals, centred=True)), LARGEST_SCATTER)
-        weights = tukey_weights(fit.residuals / (1.5 * scale))
+        previous, weights = weights, tukey_weights(fit.residuals / (1.5 * scale))
         if np.count_nonzero(weights) < LEAST_BEAMS:
             return None
         fit = _fit(beams, noise, first, last, weights)
+        if np.abs(weights - previous).max() < 0.02:
+            break
     good = np.abs(fit.residuals) < 3.5 * scale
     first, good = _trimmed(first, good)
     if np.count_nonzero(good) < LEAST_BEAMS:
