@@ -85,7 +85,7 @@ def mix_up_readings(positions: Path) -> None:
 
 def photograph(browser: Browser, pages: dict[str, Path]) -> None:
     good = browser.open(pages["turntable-result"], width=1180, height=900)
-    part(good, "report", ".top", "#scene", scale=0.8)
+    part(good, "report", ".top", ".controls", scale=0.8)
     part(good, "rig", "Camera, board", "Camera, board")
     part(good, "board", "The board as the camera", "The board as the camera", scale=0.55)
     part(good, "scan", "The scan of place", "The same scan")
@@ -94,7 +94,7 @@ def photograph(browser: Browser, pages: dict[str, Path]) -> None:
     good.close()
     for name, page, first, last in (
         ("doubtful", "doubtful", ".top", ".tiles"),
-        ("world", "world", ".top", "#scene"),
+        ("world", "world", ".top", ".controls"),
         ("faces", "world", "Place ", "Residuals of the corners"),
         ("disk", "disk", ".top", "Beams and circle"),
     ):

@@ -42,9 +42,11 @@ def pages(good_run: TurntableRun, bad_run: TurntableRun, tmp_path_factory: pytes
         "paper": turntable_run(places=20, joint=False),
         "two placements": turntable_run("mixed", placements=2, places=16),
     }
+    error = Deviation(0.0123, 0.0456)
     for name, run in runs.items():
         image = some_image(run) if name != "paper" else None
-        (folder / f"{name}.html").write_text(turntable_page(run, image), encoding="utf-8")
+        truth = TruthError(error, error, error, error) if name == "good" else None
+        (folder / f"{name}.html").write_text(turntable_page(run, image, truth=truth), encoding="utf-8")
     return {name: folder / f"{name}.html" for name in runs}
 
 

@@ -49,6 +49,12 @@ _CELLS = """
 }).map((cell) => cell.textContent.slice(0, 60))
 """
 
+# Tables that have to be scrolled sideways to be read.
+_SCROLLED = """
+[...document.querySelectorAll(".scroll")].filter((e) => e.scrollWidth > e.clientWidth + 1)
+  .map((e) => e.textContent.slice(0, 60))
+"""
+
 # Every visible drawing has a size and at least one mark beyond its axes.
 _FIGURES = """
 [...document.querySelectorAll("figure")].map((f) => {
@@ -86,6 +92,7 @@ def assert_sound(page: Page) -> None:
     assert page.run(_CUT_OFF) == []
     page.run("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
     assert page.run(_CELLS) == []
+    assert page.run(_SCROLLED) == []
     assert page.run("document.documentElement.scrollWidth <= innerWidth"), page.run(_CUT_OFF)
     assert page.run(_TEXT_TROUBLE) == []
 

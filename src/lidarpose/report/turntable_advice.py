@@ -119,17 +119,17 @@ def _extra_steps(estimate: TurntableEstimate) -> Iterator[str]:
 def _left_out_steps(run: TurntableRun) -> Iterator[str]:
     total = len(run.session.places)
     lost = total - len(used_positions(run, wholly=True))
-    if total and lost > _MUCH_LEFT_OUT * total:
+    apart = [item.what for item in run.left_out if _CONTRADICTS in item.reason]
+    if len(apart) > _MUCH_LEFT_OUT * total:
+        yield (
+            f"{len(apart)} of {plural(total, 'place')} could not be used: they contradict the others. Compare "
+            f"positions.csv with what was recorded, from {apart[0]} to {apart[-1]}: a reading or a scan that stands "
+            "one row too low or high does this. Calibrated as sessions of their own, the two parts show which is sound."
+        )
+    elif lost > _MUCH_LEFT_OUT * total:
         reasons = Counter(item.reason for item in run.left_out)
         often = f" Most often: {reasons.most_common(1)[0][0]}." if reasons else ""
         yield f"{lost} of {plural(total, 'place')} could not be used, or only in part.{often} Mend that, record again."
-    apart = [item.what for item in run.left_out if _CONTRADICTS in item.reason]
-    if total and len(apart) > _MUCH_LEFT_OUT * total:
-        yield (
-            f"Compare positions.csv with what was recorded, from {apart[0]} to {apart[-1]}: a reading or a scan that "
-            "stands one row too low or too high does this. Calibrated as sessions of their own, the two parts show "
-            "which of them is sound."
-        )
 
 
 def _layout_steps(run: TurntableRun) -> Iterator[str]:
