@@ -135,7 +135,7 @@ def fit_light_plane(stripes: Sequence[StripeOnPanel], *, seed: int = 0) -> Light
         refined = fit_plane(points, weight / sigma**2)
         turned = np.linalg.norm(np.cross(refined.normal, plane.normal))
         plane = refined
-        if turned < 1e-10:
+        if turned < 1e-8:
             break
     return _with_covariance(plane, points, spread, weight, groups, len(stripes))
 

@@ -93,7 +93,7 @@ def fit_scan_line(scan_line: ScanLine, *, robust: bool = True) -> FittedLine:
         if robust:
             standardised = line.distance(points) / sigma
             weight = weight * tukey_weights(standardised / max(1.0, mad_sigma(standardised, centred=True)))
-        if np.abs(weight - previous).max() <= 1e-6 * previous.max():
+        if np.abs(weight - previous).max() <= 1e-4 * previous.max():
             break
     middle = weight @ points / weight.sum()
     along = (points - middle) @ line.direction

@@ -14,7 +14,7 @@ from lidarpose.errors import InputError, UndeterminedError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose, log_so3
 from lidarpose.model.calibration import Quality, TurntableCalibration
-from lidarpose.model.observation import LeftOut, PlaceFeatures, StripePoints, TurntableObservations
+from lidarpose.model.observation import LeftOut, PlaceFeatures, ScanLine, StripePoints, TurntableObservations
 from lidarpose.model.session import TurntablePlace, TurntableSession
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_run import Deviation, FunctionDeviation, Method, TruthError, TurntableRun
@@ -135,15 +135,29 @@ def doubted(quality: Quality | None, features: DetectedFeatures, observations: T
 
 
 def detect_features(session: TurntableSession, *, step: Step | None = None) -> DetectedFeatures:
-    """Boards, stripes and scan lines of a session (sections 1.2 to 1.4), images decoded on all cores."""
-    boards, finders = {}, {}
-    for placement, sources in session.board_images.items():
-        boards[placement], finders[placement] = _detect_board(session, placement, [s.load() for s in sources])
-    places, left_out = [], []
-    for found, problems in _on_all_cores(lambda place: _detect_place(session, finders, place), session.places, step):
-        left_out += problems
-        if found is not None:
-            places.append(found)
+    """Boards, stripes and scan lines of a session (sections 1.2 to 1.4), on all cores.
+
+    Results are in the order of the places, whatever thread made them. Scans are read while the board is looked for.
+    """
+    executor = ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1))
+    try:
+        all_lines = executor.map(lambda place: _find_scan_lines(session, place), session.places)
+        boards, finders = {}, {}
+        for placement, sources in session.board_images.items():
+            boards[placement], finders[placement] = _detect_board(session, placement, [s.load() for s in sources])
+        all_stripes = executor.map(lambda place: _find_stripes(finders, place), session.places)
+        places, left_out = [], []
+        for place, lines, (stripes, problems) in zip(session.places, all_lines, all_stripes, strict=True):
+            left_out += problems
+            if isinstance(lines, LeftOut):
+                left_out.append(lines)
+            else:
+                angle = place.turntable_angle_rad
+                places.append(PlaceFeatures(place.position, angle, stripes, lines, place.placement))
+            if step is not None:
+                step()
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
     notes = tuple(note for board in boards.values() for note in board.notes)
     return DetectedFeatures(boards, tuple(places), tuple(left_out), notes)
 
@@ -164,40 +178,24 @@ def _detect_board(
     return board, StripeFinder(board, images)
 
 
-def _detect_place(
-    session: TurntableSession, finders: Mapping[str, StripeFinder], place: TurntablePlace
-) -> tuple[PlaceFeatures | None, list[LeftOut]]:
-    """Stripes and straight scan lines of one place; None if nothing in it can be used."""
+def _find_scan_lines(session: TurntableSession, place: TurntablePlace) -> tuple[ScanLine, ...] | LeftOut:
+    """Straight lines of a place's scan, or why there are none."""
     from lidarpose.detect.scan_lines import find_lines
 
-    problems: list[LeftOut] = []
-    stripes: Mapping[int, StripePoints] = {}
-    if place.stripe_image is not None:
-        detection = finders[place.placement].find(place.stripe_image.load())
-        stripes = detection.stripes
-        problems += [LeftOut(f"position {place.position}, {p.what}", p.reason) for p in detection.problems]
     scan = place.scan.load()
-    lines = find_lines(scan, session.lidar) if scan.has_return.any() else ()
-    if not lines:
-        reason = "its scan has no straight line" if scan.has_return.any() else "no beam of its scan has a return"
-        return None, [*problems, LeftOut(f"position {place.position}", reason)]
-    return PlaceFeatures(place.position, place.turntable_angle_rad, stripes, lines, place.placement), problems
+    if not scan.has_return.any():
+        return LeftOut(f"position {place.position}", "no beam of its scan has a return")
+    return find_lines(scan, session.lidar) or LeftOut(f"position {place.position}", "its scan has no straight line")
 
 
-def _on_all_cores(
-    work: Callable[[TurntablePlace], Any], places: Iterable[TurntablePlace], step: Step | None
-) -> list[Any]:
-    """Results in the order of the places, whatever thread made them. OpenCV and file reads run beside each other."""
-    executor = ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1))
-    results = []
-    try:
-        for result in executor.map(work, places):
-            results.append(result)
-            if step is not None:
-                step()
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
-    return results
+def _find_stripes(
+    finders: Mapping[str, StripeFinder], place: TurntablePlace
+) -> tuple[Mapping[int, StripePoints], list[LeftOut]]:
+    """Stripes of a place by panel, and what was given up."""
+    if place.stripe_image is None:
+        return {}, []
+    detection = finders[place.placement].find(place.stripe_image.load())
+    return detection.stripes, [LeftOut(f"position {place.position}, {p.what}", p.reason) for p in detection.problems]
 
 
 def assign_lines(
