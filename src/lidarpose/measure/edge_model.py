@@ -32,6 +32,8 @@ from lidarpose.measure.sampling import WALKERS, LogDensity, anneal, climb, sampl
 # Spot widths (standard deviations) that the prior allows, metres.
 SMALLEST_SPOT_M, LARGEST_SPOT_M = 4e-5, 1e-2
 _SMALLEST_SCATTER, _LARGEST_SCATTER = 1e-5, 2.0
+# Softness of these bounds, as a logarithm.
+_WALL = 0.3
 _OUTLIERS = 0.01
 # Softness of the edge of what is detected, in distances between beams.
 _SOFTNESS = 0.02
@@ -351,7 +353,8 @@ def _best_spot(
         trial = usual.copy()
         trial[8] = evenness
         density = _posterior(problem, active, trial)
-        top, value, covariance = climb(density, walkers)
+        # The second and third kind start from the top of the best before, with the walkers about it.
+        top, value, covariance = climb(density, np.vstack([walkers, chosen]))
         if value > best:
             best, kind = value, trial
             chosen = scatter_about(density, top, value, covariance, walkers, rng)
@@ -378,16 +381,20 @@ def _posterior(problem: _Problem, active: BoolArray, usual: FloatArray) -> LogDe
 
     def density(some: FloatArray) -> FloatArray:
         x = _completed(some, active, usual)
-        ok = ((x[:, 3:5] > low) & (x[:, 3:5] < high)).all(axis=1)
-        ok &= ((x[:, [5, 8]] >= 0.0) & (x[:, [5, 8]] <= 1.0)).all(axis=1)
+        ok = ((x[:, [5, 8]] >= 0.0) & (x[:, [5, 8]] <= 1.0)).all(axis=1)
         shape = problem.shape_prior(x)
         ok &= np.isfinite(shape)
         value = np.full(len(x), -np.inf)
         if ok.any():
             prior = -0.5 * ((x[ok, 3] - np.log(_USUAL_SPOT_M)) / _SPOT_SPREAD) ** 2
+            # Soft walls, as the likeliest scatter is often none: a top at a hard wall has no derivatives.
+            beyond = np.maximum(low - x[ok, 3:5], 0.0) + np.maximum(x[ok, 3:5] - high, 0.0)
+            prior -= 0.5 * ((beyond / _WALL) ** 2).sum(axis=1)
             prior -= 0.5 * x[ok, 6] ** 2 + 0.5 * (x[ok, 7] / _CONTRAST_SIGMA) ** 2
-            value[ok] = _log_likelihood(x[ok], data, problem.inside, problem.dropout) + prior + shape[ok]
-        return value
+            # Far trials of a search may overflow; what is no number is no likelihood.
+            with np.errstate(all="ignore"):
+                value[ok] = _log_likelihood(x[ok], data, problem.inside, problem.dropout) + prior + shape[ok]
+        return np.where(np.isnan(value), -np.inf, value)
 
     return density
 

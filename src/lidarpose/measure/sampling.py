@@ -12,7 +12,7 @@ LogDensity = Callable[[FloatArray], FloatArray]
 """Log-density (k,), up to a constant, of points (k, d); -inf outside its bounds."""
 
 WALKERS = 32
-_TEMPERATURES = np.geomspace(60.0, 1.0, 70)
+_TEMPERATURES = np.geomspace(60.0, 1.0, 50)
 _SETTLE = 60
 _STEPS = 200
 
@@ -55,39 +55,40 @@ def _stretch(
 
 
 def climb(log_density: LogDensity, walkers: FloatArray) -> tuple[FloatArray, float, FloatArray | None]:
-    """The top (d,) of a density by Newton's method from the best walker, its value, and the covariance there (d, d).
+    """The top (d,) of a density by damped Newton steps from the best walker, its value, and the covariance (d, d).
 
     The covariance is None where the density has no smooth top.
     """
     value = log_density(walkers)
     top, best = walkers[int(np.argmax(value))], float(np.max(value))
     scale = np.maximum(walkers.std(axis=0), 1e-12)
-    covariance = None
-    for _ in range(20):
+    damping = np.array([0.0, 0.01, 0.1, 1.0, 10.0, 100.0, 1e3])
+    for _ in range(40):
         gradient, hessian = _derivatives(log_density, top, 0.1 * scale)
         if not (np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))):
-            break
+            return top, best, None
         values, vectors = np.linalg.eigh(-hessian)
-        if values[-1] <= 0.0:
-            break
-        covariance = vectors / np.maximum(values, 0.05) @ vectors.T
-        step = covariance @ gradient
-        step *= min(1.0, 5.0 / max(float(np.linalg.norm(step)), 1e-12))
-        trials = top + scale * step * np.array([1.0, 0.5, 0.2, 0.05])[:, None]
+        # Curvature of either sign bounds the step: uphill along every axis (saddle-free Newton).
+        curvature = np.maximum(np.abs(values), 1e-3)[:, None] + damping * max(float(np.abs(values).max()), 1e-3)
+        steps = vectors @ ((vectors.T @ gradient)[:, None] / curvature)
+        trials = top + scale * steps.T
         trial_values = log_density(trials)
         winner = int(np.argmax(trial_values))
-        if not trial_values[winner] > best + 1e-3:
+        gain = float(trial_values[winner]) - best
+        # Steps of differences follow the width of the top: exact enough, and not lost in rounding.
+        width = np.sqrt(np.clip((vectors**2 / np.maximum(np.abs(values), 1e-3)).sum(axis=1), 1e-2, 25.0))
+        if gain > 0.0:
+            top, best = trials[winner], float(trial_values[winner])
+        if gain < 1e-2 and float(np.abs(width - 1.0).max()) < 0.5:
             break
-        top, best = trials[winner], float(trial_values[winner])
-        # Differences over about one standard deviation are exact enough and not lost in rounding.
-        scale = np.clip(scale * np.sqrt(np.diag(covariance)), 0.1 * scale, 10.0 * scale)
-    if covariance is not None:
-        gradient, hessian = _derivatives(log_density, top, 0.1 * scale)
-        values, vectors = np.linalg.eigh(-hessian) if np.all(np.isfinite(hessian)) else (np.zeros(1), np.eye(1))
-        covariance = None
-        if values[0] > 0.0:
-            covariance = (vectors / values @ vectors.T) * np.outer(scale, scale)
-    return top, best, covariance
+        scale = scale * width
+    gradient, hessian = _derivatives(log_density, top, 0.1 * scale)
+    if not np.all(np.isfinite(hessian)):
+        return top, best, None
+    values, vectors = np.linalg.eigh(-hessian)
+    if values[0] <= 0.0:
+        return top, best, None
+    return top, best, (vectors / values @ vectors.T) * np.outer(scale, scale)
 
 
 def scatter_about(
