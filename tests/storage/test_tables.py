@@ -7,7 +7,7 @@ import pytest
 
 from lidarpose.errors import InputError
 from lidarpose.storage.session import read_scan
-from lidarpose.storage.tables import read_text_table
+from lidarpose.storage.tables import read_number_table, read_text_table
 
 
 def write(folder: Path, text: str, encoding: str = "utf-8") -> Path:
@@ -68,3 +68,11 @@ def test_text_in_another_encoding_is_refused(tmp_path: Path) -> None:
 def test_beams_may_pass_from_359_to_0_degrees(tmp_path: Path) -> None:
     scan = read_scan(write(tmp_path, "angle_deg,range_m\n358,1\n359,1\n0,1\n1,1\n"))
     assert len(scan) == 4
+
+
+@pytest.mark.parametrize("text", ["a,b\r-c\n1,2\n", "a\rb\n", 'a,b\n"' + 200_000 * "x" + '",2\n', "a,b\n1,2\r3\n"])
+def test_what_the_csv_parser_itself_refuses(tmp_path: Path, text: str) -> None:
+    (tmp_path / "t.csv").write_bytes(text.encode())
+    for read in (read_text_table, read_number_table):
+        with pytest.raises(InputError, match=r"t\.csv"):
+            read(tmp_path / "t.csv", ("a", "b"))

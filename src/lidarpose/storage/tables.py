@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,7 +51,7 @@ def read_text_table(path: Path, required: Sequence[str], optional: Sequence[str]
     InputError
         If it is missing, not UTF-8, lacks a required column, has one that is not known, or a row of another length.
     """
-    records = list(csv.reader(io.StringIO(_read_text(path), newline="")))
+    records = list(_records(path, _read_text(path)))
     columns = _check_header(path, records[0] if records else [], required, optional)
     rows, lines = [], []
     for number, record in enumerate(records[1:], start=2):
@@ -76,7 +76,7 @@ def read_number_table(
     """
     text = _read_text(path)
     header, _, body = text.partition("\n")
-    columns = _check_header(path, next(csv.reader([header]), []), required, optional)
+    columns = _check_header(path, next(_records(path, header), []), required, optional)
     if not body.strip():
         return {name: np.zeros(0) for name in columns}
     table = _parse_numbers(body, len(columns))
@@ -84,6 +84,13 @@ def read_number_table(
     if table is None or np.isinf(table).any() or np.isnan(table[:, ~gaps_allowed]).any() or "nan" in body.lower():
         table = _parse_slowly(path, body, columns, gaps_allowed)
     return {name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(columns)}
+
+
+def _records(path: Path, text: str) -> Iterator[list[str]]:
+    try:
+        yield from csv.reader(io.StringIO(text, newline=""))
+    except csv.Error as error:
+        raise InputError(path, f"is no CSV table: {error}", expected="lines of values apart by commas") from error
 
 
 def _parse_numbers(body: str, width: int) -> FloatArray | None:
@@ -103,7 +110,7 @@ def _parse_numbers(body: str, width: int) -> FloatArray | None:
 
 def _parse_slowly(path: Path, body: str, columns: tuple[str, ...], gaps_allowed: FloatArray) -> FloatArray:
     rows = []
-    for number, record in enumerate(csv.reader(io.StringIO(body, newline="")), start=2):
+    for number, record in enumerate(_records(path, body), start=2):
         if not any(cell.strip() for cell in record):
             continue
         if len(record) != len(columns):
@@ -137,6 +144,8 @@ def _read_text(path: Path) -> str:
         raise InputError(path, f"byte {error.start} is not UTF-8 text", expected="a CSV table in UTF-8") from error
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror or error}") from error
+    if text.count("\r") != text.count("\r\n"):
+        raise InputError(path, "has carriage returns inside its lines", expected="lines that end by LF or CR LF")
     if "\0" in text:
         raise InputError(path, "holds zero bytes", expected="a CSV table in UTF-8")
     return text
