@@ -46,6 +46,7 @@ def misfit(solution: Solution) -> float:
         total += (rows - 2.0 * lines.count) * 2.0 * np.log(noise.factor)
         total += 2.0 * lines.count * np.log(whole)
         total += 40.0 * float((noise.line_weights == 0.0).sum())
+        total += 8.0 * float((~solution.at.lines[kind].valid).sum())
     corners = solution.noise.corners
     total += 2.0 * float(sum(len(w) for w in corners.weights)) * np.log(corners.factor)
     return float(total)
@@ -87,6 +88,9 @@ _SOUND: dict[Kind, float] = {"stripes": 0.5, "ranges": 0.004}
 def _sound(solution: Solution) -> bool:
     """Whether whole lines fit to half a pixel and 4 mm: an alternative that does not explains nothing."""
     kinds = solution.noise.lines.items()
+    # Beams that would have to meet their panel behind the LiDAR count as misfit, not as missing.
+    if any(solution.at.lines[kind].valid.mean() < 0.8 for kind, _ in kinds):
+        return False
     if any(np.sqrt(noise.place_variance) > _SOUND[kind] for kind, noise in kinds):
         return False
     return all((noise.line_weights == 0.0).mean() < 0.1 for _, noise in kinds)
