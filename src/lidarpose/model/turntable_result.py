@@ -35,7 +35,8 @@ class NoiseEstimate:
         Standard deviation of what a whole line (a stripe or a scan line at one place) is off by beyond that scatter;
         0 where the data show no such part.
     neighbour_factor
-        Variance inflation because what a line is off by resembles that of its neighbours; 1 where it does not.
+        Variance inflation because what a line (or corner) is off by resembles that of its neighbours; 1 where it
+        does not.
     redundancy
         Measurements less the parameters they paid for.
     """

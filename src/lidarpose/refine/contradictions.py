@@ -16,7 +16,7 @@ from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.model.turntable_result import Kind
 from lidarpose.refine.least_squares import NormalEquations
 from lidarpose.refine.turntable_joint import Solution, all_moments, lines_of, reduced_moments
-from lidarpose.refine.turntable_model import N_GLOBAL, N_MOTION, panel_jacobians
+from lidarpose.refine.turntable_model import N_GLOBAL, panel_jacobians
 
 
 @dataclass(frozen=True)
@@ -243,67 +243,3 @@ def _tested_each(
     own = (turned @ terms.own @ twists).sum(axis=0)
     gradient = (turned @ terms.gradient[:, :, None])[:, :, 0].sum(axis=0)
     return _explain(solution, own, gradient, (turned @ terms.cross).sum(axis=0))
-
-
-# --- drifts ---------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Drift:
-    """Whether what lines are off by changes smoothly over the arc, as a wrong model makes it.
-
-    `ratio`: mean square of the smooth part of the lines' effects over that of the rest; near 1 for a sound model.
-    """
-
-    ratio: float
-    freedom: int
-
-
-_SMOOTH_TERMS = 5
-
-
-def drift(solution: Solution) -> Drift | None:
-    """Smooth part of the lines' shifts and slopes over the readings, against their scatter from place to place.
-
-    None where there are too few places to tell the two apart. The ratio needs no noise level: it compares lines with
-    lines.
-    """
-    smooth = rest = 0.0
-    smooth_count = rest_count = 0.0
-    moments = all_moments(solution.data, solution.at, solution.noise)
-    for kind, m in moments.items():
-        lines = lines_of(solution.data, kind)
-        own, good = _own_effects(m)
-        good &= solution.noise.lines[kind].line_weights > 0.0
-        for slot in np.unique(lines.slot):
-            mine = good & (lines.slot == slot)
-            if mine.sum() < 4 * _SMOOTH_TERMS:
-                continue
-            angles = solution.data.angles_rad[lines.place[mine]]
-            x = (2.0 * angles - angles.min() - angles.max()) / max(np.ptp(angles), 1e-12)
-            Q = np.linalg.qr(np.polynomial.chebyshev.chebvander(x, _SMOOTH_TERMS - 1))[0]
-            for effect in own[mine].T:
-                explained = Q.T @ effect
-                left = effect - Q @ explained
-                scale = float(left @ left) / max(len(x) - _SMOOTH_TERMS, 1)
-                smooth += float(explained @ explained) / max(scale, 1e-300)
-                rest += float(left @ left) / max(scale, 1e-300)
-                smooth_count += _SMOOTH_TERMS
-                rest_count += len(x) - _SMOOTH_TERMS
-    # The parameters of motion have taken as many of the smooth terms as there are of them.
-    smooth_count -= N_MOTION
-    if smooth_count < 2.0:
-        return None
-    return Drift((smooth / smooth_count) / max(rest / max(rest_count, 1.0), 1e-300), int(smooth_count))
-
-
-def _own_effects(moments: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Least-squares shift and slope (S, 2) of each line, and where there is one."""
-    size = moments.shape[1]
-    inner = moments[:, size - 3 : size - 1, size - 3 : size - 1]
-    good = np.linalg.det(inner) > 1e-12 * np.maximum(inner[:, 0, 0], 1e-300) ** 2
-    inverse = np.linalg.inv(np.where(good[:, None, None], inner, np.eye(2)))
-    return (inverse @ moments[:, size - 3 : size - 1, -1:])[:, :, 0], np.asarray(good)
-
-
-__all__ = ["Drift", "Explanation", "drift", "explanations", "line_terms"]

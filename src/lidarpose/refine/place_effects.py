@@ -13,11 +13,13 @@ import numpy as np
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 
-LINE_REJECT = 36.0
-"""A line whose shift and slope have this chi-square of two degrees of freedom (6 sigma) or more is left out."""
+LINE_CORE, LINE_REJECT = 25.0, 49.0
+"""A line whose shift and slope have a chi-square (two degrees of freedom) above the first loses weight, and all of it
+at the second (7 sigma)."""
 _MOST_LEFT_OUT = 0.25
 _MEDIAN_CHI_SQUARE_2 = 1.3862943611
 _SIGNIFICANCE = 0.05
+_HYSTERESIS = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +39,7 @@ class _Effects:
         return inverse, square, freedom
 
 
-def place_variance(moments: FloatArray, spread: FloatArray) -> tuple[float, FloatArray]:
+def place_variance(moments: FloatArray, spread: FloatArray, before: float = 0.0) -> tuple[float, FloatArray]:
     """The variance of lines' shifts and slopes, and a weight for each line (0: it contradicts all others).
 
     Parameters
@@ -46,25 +48,29 @@ def place_variance(moments: FloatArray, spread: FloatArray) -> tuple[float, Floa
         Of `line_moments`.
     spread : (S, b, b)
         Covariance of the basis' coefficients, from the parameters' uncertainty.
+    before
+        The variance at the last step.
 
     Fisher scoring of the restricted likelihood, with what the parameters absorbed taken as shared out evenly between
-    shift and slope. Zero unless it is significant at the 5 % level.
+    shift and slope. Zero unless it is significant at the 5 % level; once found it is given up at the 30 % level only,
+    or steps would go on and off for ever.
     """
     effects, good = _effects(moments, spread)
     if good.sum() < 3:
         return 0.0, np.ones(len(moments))
     variance = _robust_start(effects, good)
-    use = _agreeing(effects, good, variance)
+    weight = _line_weights(effects, good, variance)
     for _ in range(30):
-        new = max(variance + _scoring_step(effects, use, variance), 0.0)
+        new = max(variance + _scoring_step(effects, weight * good, variance), 0.0)
         settled = abs(new - variance) <= 1e-4 * max(variance, 1e-300)
         variance = new
-        use = _agreeing(effects, good, variance)
+        weight = _line_weights(effects, good, variance)
         if settled or variance == 0.0:
             break
-    if not _significant(effects, use):
+    level = _SIGNIFICANCE if before == 0.0 else _HYSTERESIS
+    if not _significant(effects, good & (weight > 0.5), level):
         variance = 0.0
-    return variance, np.where(good & ~use, 0.0, 1.0)
+    return variance, weight
 
 
 def _effects(moments: FloatArray, spread: FloatArray) -> tuple[_Effects, BoolArray]:
@@ -86,27 +92,27 @@ def _robust_start(effects: _Effects, good: BoolArray) -> float:
     return max(ratio - 1.0, 0.0) * size
 
 
-def _agreeing(effects: _Effects, good: BoolArray, variance: float) -> BoolArray:
-    """Lines that do not contradict all others; more than a quarter cannot all be the odd ones out."""
+def _line_weights(effects: _Effects, good: BoolArray, variance: float) -> FloatArray:
+    """Weights (S,), below 1 for lines that contradict all others; at most a quarter can be the odd ones out."""
     _, square, _ = effects.standardised(variance)
-    out = good & (square > LINE_REJECT)
-    most = max(int(_MOST_LEFT_OUT * good.sum()), 1)
-    if out.sum() > most:
-        out = np.zeros_like(good)
-    return np.asarray(good & ~out)
+    root = (np.sqrt(square) - np.sqrt(LINE_CORE)) / (np.sqrt(LINE_REJECT) - np.sqrt(LINE_CORE))
+    weight = np.where(good, 0.5 * (1.0 + np.cos(np.pi * np.clip(root, 0.0, 1.0))), 1.0)
+    if (weight < 0.5).sum() > max(int(_MOST_LEFT_OUT * good.sum()), 1):
+        return np.ones(len(weight))
+    return np.asarray(weight)
 
 
-def _scoring_step(effects: _Effects, use: BoolArray, variance: float) -> float:
+def _scoring_step(effects: _Effects, weight: FloatArray, variance: float) -> float:
     inverse, _, freedom = effects.standardised(variance)
     standard = (inverse @ effects.own[:, :, None])[:, :, 0]
-    found = float((standard**2).sum(axis=1)[use].sum())
-    expected = float((np.trace(inverse, axis1=1, axis2=2) * freedom / 2.0)[use].sum())
-    fisher = float(np.einsum("sij,sji->s", inverse, inverse)[use].sum())
+    found = float(weight @ (standard**2).sum(axis=1))
+    expected = float(weight @ (np.trace(inverse, axis1=1, axis2=2) * freedom / 2.0))
+    fisher = float(weight @ np.einsum("sij,sji->s", inverse, inverse))
     return (found - expected) / max(fisher, 1e-300)
 
 
-def _significant(effects: _Effects, use: BoolArray) -> bool:
+def _significant(effects: _Effects, use: BoolArray, level: float) -> bool:
     from scipy.special import chdtri
 
     _, square, freedom = effects.standardised(0.0)
-    return bool(square[use].sum() > chdtri(max(float(freedom[use].sum()), 1.0), _SIGNIFICANCE))
+    return bool(square[use].sum() > chdtri(max(float(freedom[use].sum()), 1.0), level))

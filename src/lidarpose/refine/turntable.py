@@ -14,7 +14,7 @@ from lidarpose.model.observation import TurntableObservations
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_result import ExtraParameter, TurntableEstimate
 from lidarpose.refine.alternatives import duplicates, explain_by_alternative
-from lidarpose.refine.contradictions import drift, explanations
+from lidarpose.refine.contradictions import explanations
 from lidarpose.refine.observability import pose_spread, weak_directions, whole_turn
 from lidarpose.refine.stability import leave_places_out
 from lidarpose.refine.turntable_estimate import (
@@ -148,7 +148,7 @@ def _assemble(
         directions=directions,
         places=len(observations.places),
         duplicates=duplicates(observations),
-        drift=drift(solution),
+        drift=solution.drift,
         explanations=explanations(solution),
         mirrored_centre_px=(camera.width - 1 - 2.0 * camera.cx, camera.height - 1 - 2.0 * camera.cy),
     )

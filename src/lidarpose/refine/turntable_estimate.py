@@ -61,7 +61,8 @@ def require_determined(solution: Solution, outside: OutsideParameters) -> None:
     The message names the motion that is free.
     """
     angles = solution.data.angles_rad
-    C = outside.covariance[:10, :10]
+    # Lines that drift are a contradiction, for the verdict: they do not leave a motion open.
+    C = outside.covariance[:10, :10] / max(n.neighbour_factor for n in solution.noise.lines.values())
     inside = pose_spread(outside.motion, C, np.array([angles.min(), solution.data.reference_rad, angles.max()]))
     around = pose_spread(outside.motion, C, whole_turn(solution.data.reference_rad))
     open_inside = inside.position_m.max() > _HOPELESS_M or inside.rotation_rad.max() > _HOPELESS_RAD
@@ -85,7 +86,9 @@ def noise_estimates(solution: Solution) -> dict[Kind, NoiseEstimate]:
     used = int((weights > 0.0).sum())
     freedom, factor = used - 6.0 * len(data.slots), noise.corners.factor
     out: dict[Kind, NoiseEstimate] = {
-        "corners": NoiseEstimate(len(sigma), used, stated, factor, stated * factor, 0.0, freedom)
+        "corners": NoiseEstimate(
+            len(sigma), used, stated, factor, stated * factor, 0.0, freedom, noise.corners.smooth_factor
+        )
     }
     for kind, of_lines in noise.lines.items():
         lines = lines_of(data, kind)

@@ -9,7 +9,7 @@ way: one factor on the stated standard deviations a kind, and the variance of wh
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from lidarpose.geometry.se3 import Pose
 from lidarpose.model.observation import TurntableObservations
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_result import Kind
+from lidarpose.refine.drift import Drift, drift, smooth_factor
 from lidarpose.refine.least_squares import (
     SQRT3,
     LineEffects,
@@ -104,9 +105,12 @@ class LineNoise:
 
 @dataclass(frozen=True, eq=False)
 class CornerNoise:
+    """Noise of corners: factor on the stated sigma, weights, and how far smooth parts of the residuals exceed it."""
+
     factor: float
     weights: tuple[FloatArray, ...]
     correction: float = 1.0
+    smooth_factor: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +150,7 @@ class Solution:
     weakest: FloatArray
     iterations: int
     converged: bool
-    redundancy: Mapping[Kind, float] = field(default_factory=dict)
+    drift: Drift | None = None
 
     @property
     def state(self) -> JointState:
@@ -176,17 +180,31 @@ def solve_joint(data: JointData, start: JointState, options: JointOptions) -> So
     """
     _require_enough(data)
     active = active_parameters(data, options.estimate)
-    rows = len(data.stripes.pixels) + len(data.ranges.range_m)
-    state, spent = start, 0
-    if rows > 4 * _COARSE_ROWS * (data.stripes.lines.count + data.ranges.lines.count):
-        # Most of the way on few rows of each line; the last steps on all of them.
-        coarse = _iterate(thinned(data, _COARSE_ROWS), start, active, options.max_iterations, None)
-        state, spent = coarse.at.state, coarse.iterations
-    done = _iterate(data, state, active, options.max_iterations, coarse.noise if spent else None)
-    return _finish(data, done.at, done.noise, active, spent + done.iterations, done.converged)
+    solution = _solve(data, start, active, options.max_iterations, with_places=True)
+    if solution.drift is None or solution.drift.ratio < _NOT_RANDOM:
+        return solution
+    # Lines that drift like this are off by no random amount of their own: with that for a model the corners alone would
+    # lead the estimate away. The lines keep their full weight then, and the covariance pays for the drift.
+    return _solve(data, start, active, options.max_iterations, with_places=False)
 
 
 _COARSE_ROWS = 32
+_NOT_RANDOM = 8.0
+
+
+def _solve(data: JointData, start: JointState, active: IntArray, max_iterations: int, *, with_places: bool) -> Solution:
+    rows = len(data.stripes.pixels) + len(data.ranges.range_m)
+    state, spent, earlier = start, 0, None
+    if rows > 4 * _COARSE_ROWS * (data.stripes.lines.count + data.ranges.lines.count):
+        # Most of the way on few rows of each line; the last steps on all of them.
+        coarse = _iterate(thinned(data, _COARSE_ROWS), start, active, max_iterations, None, with_places)
+        state, spent, earlier = coarse.at.state, coarse.iterations, coarse.noise
+    done = _iterate(data, state, active, max_iterations, earlier, with_places)
+    noise = done.noise
+    if not with_places:
+        moments = all_moments(data, done.at, noise)
+        noise = update_noise(data, done.at, noise, moments, active, soft=False, with_places=True)
+    return _finish(data, done.at, noise, active, spent + done.iterations, done.converged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,23 +216,27 @@ class _Progress:
 
 
 def _iterate(
-    data: JointData, start: JointState, active: IntArray, max_iterations: int, earlier: Noise | None
+    data: JointData,
+    start: JointState,
+    active: IntArray,
+    max_iterations: int,
+    earlier: Noise | None,
+    with_places: bool,
 ) -> _Progress:
     """Steps until neither parameters nor noise move. `earlier`: the noise of a nearly finished estimate."""
     at = linearise(data, start)
     noise = first_noise(data, at) if earlier is None else carried_over(data, at, earlier)
-    soft_until, least = (3, 6) if earlier is None else (0, 2)
+    soft_until, places_from, least = (3, 8, 10) if earlier is None else (0, 0, 2)
     damping, calm, iteration = 1e-6, 0, 0
     moments = all_moments(data, at, noise)
     for iteration in range(1, max_iterations + 1):
         equations = _restricted(normal_equations(data, at, noise, moments), active)
         at, moments, damping, decrease = _damped_step(data, at, noise, equations, active, damping)
         old = noise
-        noise = update_noise(
-            data, at, noise, moments, active, soft=iteration <= soft_until, with_places=iteration >= soft_until
-        )
+        soft, places = iteration <= soft_until, with_places and iteration >= places_from
+        noise = update_noise(data, at, noise, moments, active, soft=soft, with_places=places)
         moments = all_moments(data, at, noise)
-        calm = calm + 1 if decrease < 1e-4 and _noise_change(old, noise) < 2e-3 else 0
+        calm = calm + 1 if decrease < 1e-3 and _noise_change(old, noise) < 1e-2 else 0
         if calm >= (2 if earlier is None else 1) and iteration >= least:
             return _Progress(at, noise, iteration, True)
     return _Progress(at, noise, iteration, False)
@@ -291,7 +313,7 @@ def reduced_moments(moments: FloatArray, noise: LineNoise) -> FloatArray:
 
 def _corner_weight(data: JointData, noise: CornerNoise, k: int) -> FloatArray:
     sigma = np.repeat(data.corners[k].sigma_px, 2)
-    return np.asarray(noise.weights[k] * noise.correction / (sigma * noise.factor) ** 2)
+    return np.asarray(noise.weights[k] * noise.correction / (noise.smooth_factor * (sigma * noise.factor) ** 2))
 
 
 def normal_equations(data: JointData, at: Linearised, noise: Noise, moments: Moments) -> NormalEquations:
@@ -408,7 +430,8 @@ def _update_corners(
         weights = huber_weights(together / factor)
     correction = 1.0 if soft else information_correction(together / factor, weights)
     cuts = np.cumsum([len(each) for each in z])[:-1]
-    return CornerNoise(factor, tuple(np.split(weights, cuts)), correction)
+    smooth = 1.0 if soft else smooth_factor(data.corners, at.corners)
+    return CornerNoise(factor, tuple(np.split(weights, cuts)), correction, smooth)
 
 
 def _update_lines(
@@ -424,7 +447,7 @@ def _update_lines(
     variance = 0.0
     line_weights: FloatArray = np.ones(lines.count)
     if with_places:
-        variance, line_weights = place_variance(moments, spread)
+        variance, line_weights = place_variance(moments, spread, noise.place_variance)
     reduced, effects = take_out_effects(moments, variance)
     own = _without_effects(lines, residuals, effects)
     use = residuals.valid & (line_weights[lines.line_of_row] > 0.0)
@@ -438,7 +461,7 @@ def _update_lines(
     dropped = residuals.valid & ~use
     row_weights[dropped] = huber_weights(z[dropped] / factor)
     correction = 1.0 if soft else information_correction(z[use] / factor, used_weights)
-    return LineNoise(factor, variance, row_weights, line_weights, correction)
+    return LineNoise(factor, variance, row_weights, line_weights, correction, noise.neighbour_factor)
 
 
 def _parameter_spread(
@@ -469,13 +492,17 @@ def _noise_change(a: Noise, b: Noise) -> float:
         larger = max(old.place_variance, new.place_variance)
         if larger > 0.0:
             change = max(change, 0.1 * abs(old.place_variance - new.place_variance) / larger)
-        change = max(change, float(np.abs(old.line_weights - new.line_weights).max(initial=0.0)))
+        change = max(change, 0.1 * float(np.abs(old.line_weights - new.line_weights).max(initial=0.0)))
     return change
 
 
 def _finish(
     data: JointData, at: Linearised, noise: Noise, active: IntArray, iterations: int, converged: bool
 ) -> Solution:
-    equations = normal_equations(data, at, noise, all_moments(data, at, noise))
+    moments = all_moments(data, at, noise)
+    found = drift(data, moments, {kind: n.line_weights for kind, n in noise.lines.items()})
+    factor = found.inflation if found is not None else 1.0
+    noise = replace(noise, lines={k: replace(n, neighbour_factor=factor) for k, n in noise.lines.items()})
+    equations = normal_equations(data, at, noise, moments)
     covariance, condition, weakest = covariance_and_condition(equations.information[np.ix_(active, active)])
-    return Solution(data, at, noise, equations, active, covariance, condition, weakest, iterations, converged)
+    return Solution(data, at, noise, equations, active, covariance, condition, weakest, iterations, converged, found)

@@ -10,7 +10,8 @@ import numpy as np
 
 from lidarpose.model.calibration import Quality, Verdict
 from lidarpose.model.turntable_result import Direction, ExtraParameter, Kind, NoiseEstimate
-from lidarpose.refine.contradictions import Drift, Explanation
+from lidarpose.refine.contradictions import Explanation
+from lidarpose.refine.drift import Drift
 from lidarpose.refine.observability import PoseSpread
 from lidarpose.refine.stability import Stability
 
