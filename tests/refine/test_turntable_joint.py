@@ -165,7 +165,7 @@ def test_without_scan_lines_the_message_says_so() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("black_bias_m", 0.001), ("range_offset_m", 0.004)], ids=["black", "offset"]
+    ("name", "value"), [("black_bias_m", 0.001), ("range_offset_m", 0.006)], ids=["black", "offset"]
 )
 def test_options_remove_what_they_are_for(name: str, value: float) -> None:
     rig = draw_rig(6, family="far-axis", places=40)

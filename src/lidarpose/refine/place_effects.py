@@ -70,6 +70,7 @@ def place_variance(moments: FloatArray, spread: FloatArray, before: float = 0.0)
     level = _SIGNIFICANCE if before == 0.0 else _HYSTERESIS
     if not _significant(effects, good & (weight > 0.5), level):
         variance = 0.0
+        weight = _line_weights(effects, good, variance)
     return variance, weight
 
 
