@@ -148,8 +148,8 @@ def _assemble(
         directions=directions,
         places=len(observations.places),
         duplicates=duplicates(observations),
-        drift=solution.drift,
-        explanations=explanations(solution),
+        drift=(solution.suspicious or solution).drift,
+        explanations=explanations(solution.suspicious or solution),
         mirrored_centre_px=(camera.width - 1 - 2.0 * camera.cx, camera.height - 1 - 2.0 * camera.cy),
     )
     quality = judge(evidence)
@@ -188,7 +188,7 @@ def _judged_extras(
 ) -> tuple[ExtraParameter, ...]:
     inside = pose_spread(outside.motion, outside.covariance[:10, :10], inside_at)
     out = []
-    for extra in tested_extras(solution, options):
+    for extra in tested_extras(solution.suspicious or solution, options):
         if extra.name in refused:
             extra = replace(extra, note=refused[extra.name])
         effect = (0.0, 0.0)

@@ -138,6 +138,11 @@ class Solution:
     ----------
     covariance : (n, n)
         Of the active internal parameters, `active` (n,) being their indices.
+    drift
+        See `lidarpose.refine.drift`.
+    suspicious
+        The solution with lines off by random amounts, where a drift was found in it: what explains the drift is
+        looked for there.
     """
 
     data: JointData
@@ -151,6 +156,7 @@ class Solution:
     iterations: int
     converged: bool
     drift: Drift | None = None
+    suspicious: Solution | None = None
 
     @property
     def state(self) -> JointState:
@@ -185,7 +191,8 @@ def solve_joint(data: JointData, start: JointState, options: JointOptions) -> So
         return solution
     # Lines that drift like this are off by no random amount of their own: with that for a model the corners alone would
     # lead the estimate away. The lines keep their full weight then, and the covariance pays for the drift.
-    return _solve(data, start, active, options.max_iterations, with_places=False)
+    full_weight = _solve(data, start, active, options.max_iterations, with_places=False)
+    return replace(full_weight, suspicious=solution)
 
 
 COMMON_CORNER_SIGMA_PX = 0.001
