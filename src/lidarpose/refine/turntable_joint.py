@@ -192,7 +192,9 @@ def solve_joint(data: JointData, start: JointState, options: JointOptions) -> So
     # Lines that drift like this are off by no random amount of their own: with that for a model the corners alone would
     # lead the estimate away. The lines keep their full weight then, and the covariance pays for the drift.
     full_weight = _solve(data, start, active, options.max_iterations, with_places=False)
-    return replace(full_weight, suspicious=solution)
+    # What would explain the drift is looked for as if lines were independent: the drift itself is not the noise.
+    plain = _finish(data, solution.at, solution.noise, active, solution.iterations, solution.converged, pay=False)
+    return replace(full_weight, suspicious=plain)
 
 
 COMMON_CORNER_SIGMA_PX = 0.001
@@ -511,11 +513,18 @@ def _noise_change(a: Noise, b: Noise) -> float:
 
 
 def _finish(
-    data: JointData, at: Linearised, noise: Noise, active: IntArray, iterations: int, converged: bool
+    data: JointData,
+    at: Linearised,
+    noise: Noise,
+    active: IntArray,
+    iterations: int,
+    converged: bool,
+    *,
+    pay: bool = True,
 ) -> Solution:
     moments = all_moments(data, at, noise)
     found = drift(data, moments, {kind: n.line_weights for kind, n in noise.lines.items()})
-    factor = found.inflation if found is not None else 1.0
+    factor = found.inflation if found is not None and pay else 1.0
     noise = replace(noise, lines={k: replace(n, neighbour_factor=factor) for k, n in noise.lines.items()})
     equations = normal_equations(data, at, noise, moments)
     covariance, condition, weakest = covariance_and_condition(equations.information[np.ix_(active, active)])
