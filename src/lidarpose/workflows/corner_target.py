@@ -135,6 +135,13 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
     with ThreadPoolExecutor(2) as pool:
         candidates = list(pool.map(corners_at, session.places))
     matches, world, oddity = _match_with_mistakes(candidates, world, session.estimate_scale)
+    missing = [k for k in range(len(world)) if not matches or matches[0].choice[k] is None]
+    if missing:
+        # Look again there, with another frame and another draw of samples.
+        for k in missing:
+            place = session.places[k]
+            candidates[k] += place_corners(place, seed + 1, len(place.clouds) // 2)
+        matches, world, oddity = _match_with_mistakes(candidates, world_coordinates(session), session.estimate_scale)
     if not matches:
         raise _not_found(session, candidates)
     best = matches[0]
@@ -142,7 +149,7 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
         None if k is None else _reordered(here[k], order)
         for here, k, order in zip(candidates, best.choice, best.orders, strict=True)
     )
-    return FoundTarget(sightings, best, world, oddity, _is_ambiguous(matches))
+    return FoundTarget(sightings, best, world, oddity, _is_ambiguous(matches, world))
 
 
 def place_corners(place: CornerPlace, seed: int = 0, frame: int = 0) -> tuple[CornerCandidate, ...]:
@@ -160,12 +167,13 @@ def _reordered(candidate: CornerCandidate, order: tuple[int, int, int]) -> Corne
     return replace(candidate, normals=candidate.normals[list(order)], outlines=(a, b, c))
 
 
-def _is_ambiguous(matches: Sequence[CornerMatch]) -> bool:
-    """Whether another corner fits the world as well: as many places, other corners, a residual not much worse."""
+def _is_ambiguous(matches: Sequence[CornerMatch], world: FloatArray) -> bool:
+    """Whether another corner fits the world as well: as many places, elsewhere, a residual not much worse."""
     best = matches[0]
+    corners = best.T_world_lidar.inverse() @ world
     for other in matches[1:]:
-        differing = sum(a != b for a, b in zip(best.choice, other.choice, strict=True))
-        if other.places == best.places and 2 * differing >= best.places and other.rms_m < 3.0 * best.rms_m + 0.005:
+        apart = np.linalg.norm(other.T_world_lidar.inverse() @ world - corners, axis=1)
+        if other.places == best.places and np.median(apart) > 0.1 and other.rms_m < 3.0 * best.rms_m + 0.005:
             return True
     return False
 

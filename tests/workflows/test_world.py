@@ -1,0 +1,115 @@
+"""The world job end to end on simulated sessions: the target unaided, mistakes named, half a turn, the paper's ways."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarpose.errors import UndeterminedError
+from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.se3 import Pose
+from lidarpose.model.calibration import WorldCalibration
+from lidarpose.model.corner_session import CornerSession
+from lidarpose.simulate.corner_scene import CornerSceneSpec, CornerTruth, paper_rotation, simulate_corner_session
+from lidarpose.workflows.world import LocatedTarget, calibrate_world, locate_target
+
+Simulated = tuple[CornerSession, CornerTruth, LocatedTarget]
+
+
+@pytest.fixture(scope="module")
+def simulated() -> Simulated:
+    session, truth = simulate_corner_session(CornerSceneSpec(frames=6, room=True, clutter=6, seed=1, places=5))
+    return session, truth, locate_target(session)
+
+
+def with_world(session: CornerSession, world: FloatArray) -> CornerSession:
+    places = tuple(replace(p, corner_world=w) for p, w in zip(session.places, world, strict=True))
+    return replace(session, places=places)
+
+
+def reasons(calibration: WorldCalibration) -> str:
+    assert calibration.quality is not None
+    assert calibration.quality.verdict != "good"
+    return "; ".join(calibration.quality.reasons)
+
+
+@pytest.mark.parametrize(
+    ("method", "degrees", "millimetres"),
+    [("joint", 0.02, 0.8), ("paper", 0.15, 5.0), ("paper-approx", 0.15, 5.0), ("ransac", 0.5, 20.0)],
+)
+def test_each_method_finds_the_pose(simulated: Simulated, method: str, degrees: float, millimetres: float) -> None:
+    session, truth, located = simulated
+    result = calibrate_world(session, method, located=located)  # type: ignore[arg-type]
+    metres, radians = result.T_world_source.distance(truth.T_world_lidar)
+    assert np.degrees(radians) < degrees
+    assert 1e3 * metres < millimetres
+    assert result.quality is not None
+    if method == "joint":
+        assert result.quality.verdict == "good"
+        xi = result.T_world_source.minus(truth.T_world_lidar)
+        assert xi @ np.linalg.solve(result.covariance, xi) < 22.5  # 99.9 % of chi-square with six degrees
+
+
+def test_half_a_turn_of_yaw_costs_nothing() -> None:
+    pose = Pose(paper_rotation(180.0, 25.0, 0.0), np.array([1.0, -2.0, 1.5]))
+    session, truth = simulate_corner_session(CornerSceneSpec(pose=pose, frames=4, places=4, seed=2))
+    located = locate_target(session)
+    for method, limit_deg in (("joint", 0.03), ("paper", 0.15)):
+        result = calibrate_world(session, method, located=located)  # type: ignore[arg-type]
+        assert np.degrees(result.T_world_source.distance(truth.T_world_lidar)[1]) < limit_deg
+
+
+@pytest.mark.parametrize(
+    ("mistake", "named"),
+    [
+        ("millimetres", "millimetres"),
+        ("mirrored", "left-handed"),
+        ("swapped", "swapped"),
+        ("5 cm", "p01"),
+        ("1 %", "times"),
+    ],
+)
+def test_mistakes_in_the_coordinates_are_named(simulated: Simulated, mistake: str, named: str) -> None:
+    session, _, _ = simulated
+    world = np.stack([p.corner_world for p in session.places])
+    wrong = {
+        "millimetres": 1000.0 * world,
+        "mirrored": world * [1.0, -1.0, 1.0],
+        "swapped": world[[1, 0, 2, 3, 4]],
+        "5 cm": world + 0.05 * np.outer(np.arange(5) == 1, [0.0, 1.0, 0.0]),
+        "1 %": 1.01 * world,
+    }[mistake]
+    assert named in reasons(calibrate_world(with_world(session, wrong)))
+
+
+def test_a_turned_target_is_named() -> None:
+    spec = CornerSceneSpec(frames=4, places=4, seed=3, turned_place=2, turned_deg=2.0)
+    session, _ = simulate_corner_session(spec)
+    assert "turned" in reasons(calibrate_world(session))
+
+
+def test_places_in_one_plane_that_turn_the_sensor_upside_down_are_doubted(simulated: Simulated) -> None:
+    session, truth, _ = simulated
+    heights = truth.corners_world[:, 2]
+    flat = [k for k in range(5) if abs(heights[k] - np.median(heights)) < 0.01]
+    if len(flat) < 3:
+        pytest.skip("this seed raises the target too often")
+    few = replace(session, places=tuple(session.places[k] for k in flat))
+    world = np.stack([p.corner_world for p in few.places]) * [1.0, -1.0, 1.0]
+    assert "upside down" in reasons(calibrate_world(with_world(few, world)))
+
+
+def test_a_target_that_stands_still_is_no_answer(simulated: Simulated) -> None:
+    session, _, _ = simulated
+    still = tuple(replace(p, clouds=session.places[0].clouds) for p in session.places)
+    with pytest.raises(UndeterminedError, match="no corner"):
+        calibrate_world(replace(session, places=still))
+
+
+def test_hints_give_the_same_answer(simulated: Simulated) -> None:
+    session, truth, _ = simulated
+    hinted = tuple(
+        replace(p, near=c + [0.1, -0.1, 0.05]) for p, c in zip(session.places, truth.corners_lidar, strict=True)
+    )
+    result = calibrate_world(replace(session, places=hinted))
+    assert result.T_world_source.distance(truth.T_world_lidar)[0] < 1e-3
