@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from lidarpose.errors import InputError
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.image import GrayImage
+from lidarpose.model.scan import Scan
+from lidarpose.model.turntable_result import ResidualGroup
 from lidarpose.model.turntable_run import Deviation, TruthError, TurntableRun
 from lidarpose.report.turn_numbers import turn_numbers
 from lidarpose.report.turntable_page import turntable_page
@@ -179,6 +184,63 @@ def test_report_without_covariance(good_run: TurntableRun) -> None:
     text = turntable_page(replace(good_run, method="paper", estimate=None, calibration=calibration), None)
     assert "No verdict" in text
     assert "This method gives no standard deviations" in text
+
+
+class _MissingScan:
+    name = "scans/000.csv"
+
+    def load(self) -> Scan:
+        raise InputError(self.name, "is missing")
+
+
+def _with_estimate(run: TurntableRun, **changes: object) -> TurntableRun:
+    assert run.estimate is not None
+    return replace(run, estimate=replace(run.estimate, **changes))
+
+
+def _each_residual(run: TurntableRun, change: Callable[[ResidualGroup], ResidualGroup]) -> TurntableRun:
+    assert run.estimate is not None
+    return _with_estimate(run, residuals=tuple(change(group) for group in run.estimate.residuals))
+
+
+def _one_panel(run: TurntableRun) -> TurntableRun:
+    def only(found: Mapping[int, Any]) -> dict[int, Any]:
+        return {k: v for k, v in found.items() if k == 0}
+
+    places = tuple(replace(p, stripes=only(p.stripes), scan_lines=only(p.scan_lines)) for p in run.observations.places)
+    assert run.estimate is not None
+    residuals = tuple(g for g in run.estimate.residuals if g.panel == 0)
+    poses = {name: (found[0], None) for name, found in run.estimate.panel_poses.items()}
+    changed = _with_estimate(run, residuals=residuals, panel_poses=poses)
+    return replace(changed, observations=replace(run.observations, places=places))
+
+
+def _lost_scans(run: TurntableRun) -> TurntableRun:
+    places = tuple(replace(p, scan=_MissingScan()) for p in run.session.places)
+    return replace(run, session=replace(run.session, places=places))
+
+
+ODD_RUNS: dict[str, Callable[[TurntableRun], TurntableRun]] = {
+    "no residuals": lambda run: _with_estimate(run, residuals=()),
+    "no directions, no extras": lambda run: _with_estimate(run, directions=(), extras=()),
+    "nothing has weight": lambda run: _each_residual(run, lambda g: replace(g, weights=0.0 * g.weights)),
+    "residuals are exactly zero": lambda run: _each_residual(run, lambda g: replace(g, values=0.0 * g.values)),
+    "residuals are not finite": lambda run: _each_residual(run, lambda g: replace(g, values=np.nan * g.values)),
+    "no places": lambda run: replace(run, observations=replace(run.observations, places=()), samples={}),
+    "one panel": _one_panel,
+    "the scans are gone": _lost_scans,
+    "covariance is zero": lambda run: _with_estimate(run, parameter_covariance=np.zeros((22, 22))),
+    "covariance is huge": lambda run: _with_estimate(run, parameter_covariance=1e9 * np.eye(22)),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("odd", ODD_RUNS)
+def test_odd_runs_have_a_page(bad_run: TurntableRun, odd: str) -> None:
+    """A report never fails a calibration, whatever is missing from it."""
+    text = turntable_page(ODD_RUNS[odd](bad_run), None)
+    assert_well_formed(text)
+    assert not re.search(r"\b(nan|inf)\b", text.split("<body>")[1].split("<script")[0], re.IGNORECASE)
 
 
 def assert_well_formed(text: str) -> None:

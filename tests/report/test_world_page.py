@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -72,3 +75,40 @@ def test_kept_run_holds_the_faces_and_their_corner(runs: dict[str, WorldRun]) ->
             assert np.std(off) < 0.012
         assert np.nanmax(np.abs(place.frame_corners - place.corner)) < 0.02
         assert np.linalg.norm(place.residual_world(run.calibration)) < 0.002
+
+
+def _faceless(run: WorldRun) -> WorldRun:
+    places = tuple(replace(p, faces={k: v for k, v in p.faces.items() if k < 2}) for p in run.places)
+    return replace(run, places=places)
+
+
+def _frames_unknown(run: WorldRun) -> WorldRun:
+    places = tuple(replace(p, frame_corners=np.full_like(p.frame_corners, np.nan)) for p in run.places)
+    return replace(run, places=places)
+
+
+def _no_verdict(run: WorldRun) -> WorldRun:
+    return replace(run, calibration=replace(run.calibration, quality=None, covariance=None))
+
+
+def _all_frames_left_out(run: WorldRun) -> WorldRun:
+    return replace(run, places=tuple(replace(p, frame_used=np.zeros_like(p.frame_used)) for p in run.places))
+
+
+ODD_RUNS: dict[str, Callable[[WorldRun], WorldRun]] = {
+    "no places": lambda run: replace(run, places=()),
+    "two faces a place": _faceless,
+    "no frame shows a corner": _frames_unknown,
+    "all frames left out": _all_frames_left_out,
+    "no verdict": _no_verdict,
+    "another scale": lambda run: replace(run, calibration=replace(run.calibration, scale=1.01, source="camera")),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("odd", ODD_RUNS)
+def test_odd_runs_have_a_page(runs: dict[str, WorldRun], odd: str) -> None:
+    """A report never fails a calibration, whatever is missing from it."""
+    text = world_page(ODD_RUNS[odd](runs["good"]))
+    assert not re.search(r"\b(nan|inf)\b", text.split("<body>")[1].split("<script")[0], re.IGNORECASE)
+    assert "To repeat this run" in text

@@ -204,7 +204,7 @@ def provenance_block(provenance: Mapping[str, Any]) -> Markup:
     if rows:
         parts.append(table(("", ""), rows))
     if hashes:
-        listed = table(("input", "SHA-256"), ((k, el("code", str(v))) for k, v in hashes.items()))
+        listed = table(("input", "SHA-256"), ((el("code", k), el("code", str(v))) for k, v in hashes.items()))
         parts.append(folded(f"{len(hashes)} input files with their SHA-256", listed))
     return card("", *parts)
 

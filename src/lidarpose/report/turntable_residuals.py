@@ -24,7 +24,7 @@ def residuals_by_place(run: TurntableRun, estimate: TurntableEstimate, kind: Kin
     """Box plots of what is left over at each place, against the expected spread."""
     order = {place.position: k + 1 for k, place in enumerate(run.session.places)}
     used = [
-        (order[str(g.position)], g.panel, _SCALE[kind] * g.values[g.weights > LEAST_WEIGHT])
+        (order[str(g.position)], g.panel, _SCALE[kind] * g.values[(g.weights > LEAST_WEIGHT) & np.isfinite(g.values)])
         for g in estimate.residuals
         if g.kind == kind and str(g.position) in order
     ]
@@ -206,7 +206,8 @@ def _corner_residuals(run: TurntableRun, estimate: TurntableEstimate) -> tuple[F
         pixels.append(found[group.panel].pixels[use].reshape(-1, 2))
         arrows.append(group.values.reshape(-1, 2)[use].reshape(-1, 2))
         panels.append(np.full(len(arrows[-1]), group.panel))
-    return np.concatenate(pixels), np.concatenate(arrows), np.concatenate(panels)
+    finite = np.isfinite(np.concatenate(arrows)).all(axis=1)
+    return np.concatenate(pixels)[finite], np.concatenate(arrows)[finite], np.concatenate(panels)[finite]
 
 
 def _stripe_residuals(run: TurntableRun, estimate: TurntableEstimate) -> tuple[FloatArray, FloatArray]:
@@ -219,7 +220,7 @@ def _stripe_residuals(run: TurntableRun, estimate: TurntableEstimate) -> tuple[F
         stripe = place.stripes.get(group.panel) if place is not None else None
         if group.kind != "stripes" or stripe is None or len(stripe) != len(group.values):
             continue
-        use = group.weights > LEAST_WEIGHT
+        use = (group.weights > LEAST_WEIGHT) & np.isfinite(group.values)
         where.append(stripe.pixels[use])
         arrows.append((group.values[:, None] * stripe.normals)[use])
     return np.concatenate(where), np.concatenate(arrows)

@@ -20,6 +20,7 @@ _FACE_COLOURS = ("--p1", "--p2", "--lidar")
 _AXES = ("x", "y", "z")
 _MOST_POINTS_A_FACE = 150
 _MOST_POINTS_IN_FIGURE = 1500
+MIN_FRAMES = 5
 
 
 def world_scene(run: WorldRun) -> dict[str, Any]:
@@ -124,12 +125,13 @@ def corner_residuals(run: WorldRun) -> Markup:
 
 def frame_boxes(run: WorldRun) -> Markup | None:
     """Box plots, place by place, of the corner of each single frame, along the clouds' axes."""
-    rows = [(k + 1, p) for k, p in enumerate(run.places) if np.isfinite(p.frame_corners).all(axis=1).sum() >= 5]
+    known = {k + 1: np.isfinite(p.frame_corners).all(axis=1) & p.frame_used for k, p in enumerate(run.places)}
+    rows = [(k + 1, p) for k, p in enumerate(run.places) if known[k + 1].sum() >= MIN_FRAMES]
     if not rows:
         return None
-    off = {k: 1e3 * (p.frame_corners - np.nanmedian(p.frame_corners, axis=0)) for k, p in rows}
-    used = np.concatenate([off[k][p.frame_used] for k, p in rows])
-    reach = 1.3 * float(np.nanpercentile(np.abs(used), 99.5))
+    off = {k: 1e3 * (p.frame_corners - np.median(p.frame_corners[known[k]], axis=0)) for k, p in rows}
+    used = np.concatenate([off[k][known[k]] for k, _ in rows])
+    reach = max(1.3 * float(np.percentile(np.abs(used), 99.5)), 1e-3)
 
     def draw(width: float) -> Markup:
         count = len(run.places)
@@ -139,8 +141,8 @@ def frame_boxes(run: WorldRun) -> Markup | None:
         thick = min(10.0, 0.1 * width / count)
         for axis, class_ in enumerate(FACE_CLASSES):
             where = np.array([k + 0.2 * (axis - 1) for k, _ in rows])
-            kept = [off[k][p.frame_used, axis] for k, p in rows]
-            five = np.array([np.nanpercentile(v, [2.5, 25.0, 75.0, 97.5]) for v in kept])
+            kept = [off[k][known[k], axis] for k, _ in rows]
+            five = np.array([np.percentile(v, [2.5, 25.0, 75.0, 97.5]) for v in kept])
             chart.sticks(where, five[:, 0], five[:, 3], f"{class_} mid", max(1.0, thick / 5.0))
             chart.sticks(where, five[:, 1], five[:, 2], class_, thick)
             for at, (k, p) in zip(where, rows, strict=True):
