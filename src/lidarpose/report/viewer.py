@@ -115,7 +115,8 @@ def _log(rerun: Any, stream: Any, drawn: Sequence[Layer], camera_frame: bool) ->
             entity = rerun.Points3D(layer.points, colors=layer.colours, labels=labels)
         else:
             entity = rerun.LineStrips3D(list(layer.points), colors=[layer.colours] * len(layer.points), labels=labels)
-        stream.log(layer.name, entity, static=True)
+        # As a list of parts, names from files need no escaping.
+        stream.log(layer.name.split("/"), entity, static=True)
 
 
 def _cloud_layer(name: str, cloud: Cloud) -> Layer:
