@@ -364,16 +364,27 @@ def first_noise(data: JointData, at: Linearised) -> Noise:
     for kind, residuals in at.lines.items():
         layout = lines_of(data, kind)
         z = np.where(residuals.valid, residuals.residual / layout.sigma, 0.0)
-        factor = _floor(mad_sigma(z[residuals.valid], centred=True))
+        factor = _floor(mad_sigma(z[residuals.valid], centred=True), kind, layout.sigma)
         lines[kind] = LineNoise(factor, 0.0, huber_weights(z / factor), np.ones(layout.count))
     z_corners = _standardised_corners(data, at)
-    factor = _floor(mad_sigma(np.concatenate(z_corners), centred=True))
+    factor = _floor(mad_sigma(np.concatenate(z_corners), centred=True), "corners", _corner_sigmas(data))
     return Noise(CornerNoise(factor, tuple(huber_weights(z / factor) for z in z_corners)), lines)
 
 
-def _floor(factor: float) -> float:
-    """Perfect data must not divide by zero: a billionth of the stated noise is the least."""
-    return max(factor, 1e-9) if np.isfinite(factor) else 1.0
+_LEAST_SIGMA: dict[Kind, float] = {"corners": 1e-3, "stripes": 1e-3, "ranges": 1e-6}
+"""px, px and m: no instrument is better. Perfect data must neither divide by zero nor, where one kind alone is perfect,
+make the equations so uneven that they cannot be solved."""
+
+
+def _floor(factor: float, kind: Kind, stated_sigma: FloatArray) -> float:
+    if not np.isfinite(factor):
+        return 1.0
+    finite = stated_sigma[np.isfinite(stated_sigma)]
+    return max(factor, _LEAST_SIGMA[kind] / float(np.median(finite))) if len(finite) else max(factor, 1e-9)
+
+
+def _corner_sigmas(data: JointData) -> FloatArray:
+    return np.concatenate([corners.sigma_px for corners in data.corners])
 
 
 def _standardised_corners(data: JointData, at: Linearised) -> list[FloatArray]:
@@ -420,7 +431,7 @@ def update_noise(
     lines: dict[Kind, LineNoise] = {}
     for kind, residuals in at.lines.items():
         lines[kind] = _update_lines(
-            lines_of(data, kind), residuals, noise.lines[kind], moments[kind], full, soft, with_places
+            kind, lines_of(data, kind), residuals, noise.lines[kind], moments[kind], full, soft, with_places
         )
     return Noise(_update_corners(data, at, noise.corners, full, soft), lines)
 
@@ -437,7 +448,7 @@ def _update_corners(
         weight = _corner_weight(data, noise, k)
         paid += float(np.einsum("ij,ij->", J.T @ (weight[:, None] * J), covariance[own, own]))
     factor, weights = robust_scale(together, min(paid, 6.0 * len(z)))
-    factor = _floor(factor)
+    factor = _floor(factor, "corners", _corner_sigmas(data))
     if soft:
         weights = huber_weights(together / factor)
     correction = 1.0 if soft else information_correction(together / factor, weights)
@@ -450,6 +461,7 @@ def _update_corners(
 
 
 def _update_lines(
+    kind: Kind,
     lines: Lines,
     residuals: LineResiduals,
     noise: LineNoise,
@@ -470,7 +482,7 @@ def _update_lines(
     paid += _effect_freedom(effects, variance)
     z = own / lines.sigma
     factor, used_weights = robust_scale(z[use], min(paid, 0.5 * use.sum()))
-    factor = _floor(factor)
+    factor = _floor(factor, kind, lines.sigma)
     row_weights = np.zeros(len(z))
     row_weights[use] = huber_weights(z[use] / factor) if soft else used_weights
     dropped = residuals.valid & ~use
