@@ -161,3 +161,32 @@ def draw_flat_board(path: Path) -> None:
     for top in (40, 650):
         image[top : top + squares.shape[0], 400 : 400 + squares.shape[1]] = squares
     assert cv2.imwrite(str(path), cv2.GaussianBlur(image, (0, 0), 0.8))
+
+
+@pytest.mark.slow
+def test_a_laser_that_no_camera_sees_needs_two_placements_of_the_board(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    common = ["--seed", "4", "--places", "8", "--no-stripe", "--quiet"]
+    assert run(["simulate", "turntable", str(tmp_path / "two"), "--placements", "2", *common]) == 0
+    capsys.readouterr()
+    assert run(["calibrate", str(tmp_path / "two"), "-o", str(tmp_path / "out"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["table_1"] is None
+    middle = document["sigma"][1]
+    error = document["error_against_truth"]["arc"]
+    assert error["centre_mm"]["largest"] < 4.0 * middle["centre_mm"]
+    assert error["rotation_deg"]["largest"] < 4.0 * middle["rotation_deg"]
+    assert run(["simulate", "turntable", str(tmp_path / "one"), *common]) == 0
+    assert run(["calibrate", str(tmp_path / "one"), "-o", str(tmp_path / "out1")]) == 1
+    assert "two or more placements" in capsys.readouterr().err
+
+
+def test_exact_scans_are_no_obstacle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    session = tmp_path / "exact"
+    options = ["--seed", "3", "--family", "mixed", "--places", "5", "--noise-free", "--quiet"]
+    assert run(["simulate", "turntable", str(session), *options]) == 0
+    capsys.readouterr()
+    assert run(["calibrate", str(session), "-o", str(tmp_path / "out"), "--json", "--no-report"]) == 0
+    error = json.loads(capsys.readouterr().out)["error_against_truth"]["arc"]
+    assert error["centre_mm"]["largest"] < 0.05

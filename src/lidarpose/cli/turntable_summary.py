@@ -14,7 +14,7 @@ from lidarpose.report.turntable_page import turntable_verdict
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from lidarpose.model.turntable_run import Deviation, TruthError, TurntableRun
+    from lidarpose.model.turntable_run import Deviation, FunctionDeviation, TruthError, TurntableRun
 
 
 def summary(run: TurntableRun, error: TruthError | None) -> dict[str, Any]:
@@ -25,13 +25,9 @@ def summary(run: TurntableRun, error: TruthError | None) -> dict[str, Any]:
         "method": run.method,
         "verdict": None if quality is None else quality.verdict,
         "reasons": [] if quality is None else list(quality.reasons),
-        "places": {"recorded": len(run.session.places), "used": len(run.samples)},
+        "places": {"recorded": len(run.session.places), "used": places_used(run)},
         "radius_mm": 1e3 * run.calibration.motion.radius_m,
-        "table_1": {
-            "centre_mm": _pair(run.deviation.centre_mm),
-            "z_deg": _pair(run.deviation.z_deg),
-            "x_deg": _pair(run.deviation.x_deg),
-        },
+        "table_1": None if run.deviation is None else _table_1(run.deviation),
         "sigma": [
             {"angle_deg": angle, "centre_mm": centre, "rotation_deg": rotation}
             for angle, centre, rotation in sigma_rows(run)
@@ -45,6 +41,31 @@ def summary(run: TurntableRun, error: TruthError | None) -> dict[str, Any]:
             "turn": {"centre_mm": _pair(error.turn_centre_mm), "rotation_deg": _pair(error.turn_rotation_deg)},
         }
     return document
+
+
+def places_used(run: TurntableRun) -> int:
+    """Places that the answer rests on."""
+    return len(run.samples) if run.samples else len(run.observations.places)
+
+
+def _table_1(deviation: FunctionDeviation) -> dict[str, Any]:
+    return {
+        "centre_mm": _pair(deviation.centre_mm),
+        "z_deg": _pair(deviation.z_deg),
+        "x_deg": _pair(deviation.x_deg),
+    }
+
+
+def _print_deviation(console: Console, found: FunctionDeviation) -> None:
+    rows = [
+        (name, f"{deviation.mean:.{digits}f}", f"{deviation.largest:.{digits}f}")
+        for name, deviation, digits in (
+            ("LiDAR's centre / mm", found.centre_mm, 2),
+            ("z axis / deg", found.z_deg, 3),
+            ("x axis / deg", found.x_deg, 3),
+        )
+    ]
+    console.print(figures_table("Deviation from the single places (the paper's Table 1)", ("mean", "largest"), rows))
 
 
 def sigma_rows(run: TurntableRun) -> list[tuple[float, float, float]]:
@@ -65,18 +86,11 @@ def print_summary(console: Console, run: TurntableRun, error: TruthError | None,
     """The result for a person: the verdict with its reasons and what to do, then the figures."""
     print_verdict(console, turntable_verdict(run))
     _print_sigmas(console, run)
-    rows = [
-        (name, f"{deviation.mean:.{digits}f}", f"{deviation.largest:.{digits}f}")
-        for name, deviation, digits in (
-            ("LiDAR's centre / mm", run.deviation.centre_mm, 2),
-            ("z axis / deg", run.deviation.z_deg, 3),
-            ("x axis / deg", run.deviation.x_deg, 3),
-        )
-    ]
-    console.print(figures_table("Deviation from the single places (the paper's Table 1)", ("mean", "largest"), rows))
+    if run.deviation is not None:
+        _print_deviation(console, run.deviation)
     if error is not None:
         _print_truth(console, error)
-    console.print(f"{len(run.samples)} of {len(run.session.places)} places used, method {run.method}")
+    console.print(f"{places_used(run)} of {len(run.session.places)} places used, method {run.method}")
     for file in written:
         console.print(f"written: {file}", markup=False, soft_wrap=True)
 

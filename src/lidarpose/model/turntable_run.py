@@ -57,11 +57,11 @@ class TurntableRun:
     session, observations
         What was recorded, and what was found in it.
     samples
-        T_camera_lidar of each place by itself, by position (section 1 of the paper).
+        T_camera_lidar of each place by itself, by position (section 1 of the paper); empty where no stripe was seen.
     paper_motion
-        The motion by the paper's method (section 2).
+        The motion by the closed form (section 2 of the paper), or without stripes from boards and scans alone.
     deviation
-        Of the reported motion from the samples.
+        Of the reported motion from the samples; None where there are none.
     estimate
         The joint estimate with its evidence; None for method `paper`.
     calibration
@@ -77,7 +77,7 @@ class TurntableRun:
     observations: TurntableObservations
     samples: Mapping[str, Pose]
     paper_motion: TurntableMotion
-    deviation: FunctionDeviation
+    deviation: FunctionDeviation | None
     calibration: TurntableCalibration
     estimate: TurntableEstimate | None = None
     left_out: tuple[LeftOut, ...] = ()

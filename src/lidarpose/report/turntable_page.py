@@ -325,6 +325,9 @@ def _left_out_section(run: TurntableRun) -> Markup:
 
 def _paper_section(run: TurntableRun) -> Markup:
     d = run.deviation
+    if d is None:
+        text = "No stripe was seen, so no place has a pose of its own, and the paper's method cannot be used."
+        return section("Agreement with the paper's method", "", card("", el("p", text)))
     rows = [
         ("LiDAR's centre, mm", fixed(d.centre_mm.mean, 3), fixed(d.centre_mm.largest, 3)),
         ("z axis, °", fixed(d.z_deg.mean, 4), fixed(d.z_deg.largest, 4)),

@@ -90,11 +90,16 @@ def calibrate_turntable(
     """
     features = detect_features(session, step=step)
     observations = assign_lines(session, features, first_panel=first_panel)
-    paper = solve(observations)
-    samples = {position: sample.pose for position, sample in paper.samples.items()}
     estimate = None
+    samples: Mapping[str, Pose] = {}
+    if method == "joint" and not any(place.stripes for place in observations.places):
+        start = start_without_stripes(observations)
+    else:
+        paper = solve(observations)
+        start = start_of(paper)
+        samples = {position: sample.pose for position, sample in paper.samples.items()}
     if method == "joint":
-        estimate = refine(observations, paper, options, features)
+        estimate = refine(observations, start, options)
         calibration = estimate.calibration(provenance)
         left_out = estimate.left_out
     else:
@@ -106,8 +111,8 @@ def calibrate_turntable(
         session=session,
         observations=observations,
         samples=samples,
-        paper_motion=paper.motion,
-        deviation=deviation_from_samples(calibration.motion, observations, samples),
+        paper_motion=start[0],
+        deviation=deviation_from_samples(calibration.motion, observations, samples) if samples else None,
         calibration=calibration,
         estimate=estimate,
         left_out=merge_left_out(observations.left_out, left_out),
@@ -220,24 +225,30 @@ def solve(observations: TurntableObservations) -> PaperSolution:
     return solve_paper(observations)
 
 
-def refine(
-    observations: TurntableObservations,
-    start: PaperSolution,
-    options: JointOptions | None,
-    features: DetectedFeatures,
-) -> TurntableEstimate:
+def start_of(paper: PaperSolution) -> Start:
+    """Motion and panels of the closed form, where the joint estimate starts."""
+    poses = {name: tuple(p.T_camera_panel for p in panels) for name, panels in paper.panel_poses.items()}
+    return paper.motion, poses
+
+
+def start_without_stripes(observations: TurntableObservations) -> Start:
+    """Motion from boards and scans alone, for a laser that no camera sees: each scan line lies on its panel's plane."""
+    from lidarpose.solve.assignment_blind import motion_without_stripes
+    from lidarpose.solve.paper import board_poses
+
+    panels = {name: board_poses(observations.camera, c, name) for name, c in observations.corners.items()}
+    motion = motion_without_stripes(observations, panels)
+    return motion, {name: tuple(p.T_camera_panel for p in found) for name, found in panels.items()}
+
+
+def refine(observations: TurntableObservations, start: Start, options: JointOptions | None = None) -> TurntableEstimate:
     """The joint estimate, started from the closed form."""
     from lidarpose.refine.turntable import JointOptions, refine_turntable
 
     def restart(other: TurntableObservations) -> Start:
-        return _start_of(solve(other))
+        return start_of(solve(other))
 
-    return refine_turntable(observations, *_start_of(start), replace(options or JointOptions(), restart=restart))
-
-
-def _start_of(paper: PaperSolution) -> Start:
-    poses = {name: tuple(p.T_camera_panel for p in panels) for name, panels in paper.panel_poses.items()}
-    return paper.motion, poses
+    return refine_turntable(observations, *start, replace(options or JointOptions(), restart=restart))
 
 
 def paper_quality(paper: PaperSolution) -> Quality:

@@ -18,6 +18,8 @@ from lidarpose.workflows.turntable import (
     merge_left_out,
     refine,
     solve,
+    start_of,
+    start_without_stripes,
 )
 
 if TYPE_CHECKING:
@@ -81,9 +83,13 @@ def inspect_turntable(session: TurntableSession, *, step: Step | None = None) ->
         observations = assign_lines(session, features)
         left_out = observations.left_out
         used = len(observations.places)
-        start = solve(observations)
-        left_out = merge_left_out(left_out, start.left_out)
-        estimate = refine(observations, start, None, features)
+        if any(place.stripes for place in observations.places):
+            paper = solve(observations)
+            left_out = merge_left_out(left_out, paper.left_out)
+            start = start_of(paper)
+        else:
+            start = start_without_stripes(observations)
+        estimate = refine(observations, start)
     except UndeterminedError as error:
         undetermined = error
     degrees = np.rad2deg([place.turntable_angle_rad for place in session.places])
