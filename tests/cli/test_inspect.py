@@ -31,7 +31,7 @@ def test_a_session_without_stripes_is_described_and_refused(
     assert run(["inspect", str(session), "--quiet"]) == 1
     captured = capsys.readouterr()
     assert "0 places usable" in captured.out
-    assert "Record more places" in captured.err
+    assert "Make the laser's stripe visible" in captured.err
 
 
 def test_people_get_lines_of_text(simulated_session: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -107,3 +107,14 @@ def test_an_unwritable_or_unknown_output_leaves_nothing(folder: Path) -> None:
     before = sorted(folder.iterdir())
     assert run(["scan", str(folder / "rec"), str(folder / "cal.json"), "-o", str(folder / "cloud.stl")]) == 2
     assert sorted(folder.iterdir()) == before
+
+
+def test_npy_is_a_plain_array_unless_more_is_asked_for(tmp_path: Path) -> None:
+    assert run(["simulate", "disk", str(tmp_path / "disk"), "--sweep-step-deg", "1"]) == 0
+    recording, calibration = str(tmp_path / "disk"), str(tmp_path / "disk.calibration.json")
+    ranges = np.load(tmp_path / "disk" / "range_m.npy")
+    np.save(tmp_path / "disk" / "intensity.npy", np.ones(ranges.shape, np.float32))
+    assert run(["scan", recording, calibration, "-o", str(tmp_path / "a.npy")]) == 0
+    assert np.load(tmp_path / "a.npy").shape == (np.isfinite(ranges).sum(), 3)
+    assert run(["scan", recording, calibration, "-o", str(tmp_path / "b.npy"), "--indices"]) == 0
+    assert set(np.load(tmp_path / "b.npy").dtype.names) == {"x", "y", "z", "intensity", "sweep", "beam"}

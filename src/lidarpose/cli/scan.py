@@ -40,7 +40,8 @@ def scan(
     calibration
         The turntable's calibration file.
     output
-        The cloud to write: .ply .pcd .las .laz .e57 .npy
+        The cloud to write: .ply .pcd .las .laz .e57 .npy; .npy is a plain (N, 3) array, without intensity, unless
+        --sigma or --indices ask for more.
     world
         A world calibration for the camera frame; puts the cloud in the world's frame.
     nearest_m
@@ -68,7 +69,11 @@ def scan(
     sweeps = read_recording(recording)
     turntable = read_turntable_calibration(calibration)
     world_calibration = None if world is None else read_world_calibration(world)
-    options = ScanOptions(nearest_m, farthest_m, drop_mixed, sigma, indices, keep_order, never_stops)
+    # An array of plain numbers is what numpy.load is expected to give, unless more than points was asked for.
+    plain = output.suffix.lower() == ".npy" and not (sigma or indices)
+    options = ScanOptions(
+        nearest_m, farthest_m, drop_mixed, sigma, indices, keep_order, never_stops, intensity=not plain
+    )
     remarks = _remarks(sigma, turntable, sweeps)
     points = 0
     with (

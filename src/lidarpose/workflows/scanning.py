@@ -42,6 +42,8 @@ class ScanOptions:
         Keep beams without return, as NaN points, so that the cloud has N * M points in the order of the recording.
     never_stops
         The turntable turned on during each sweep: interpolate between the readings by the times.
+    intensity
+        Give each point the field `intensity`, where the recording has it.
     """
 
     nearest_m: float = 0.0
@@ -51,11 +53,12 @@ class ScanOptions:
     indices: bool = False
     keep_order: bool = False
     never_stops: bool = False
+    intensity: bool = True
 
     def fields(self, recording: SweepRecording) -> dict[str, np.dtype[Any]]:
         """Names and types of the fields that the clouds will have."""
         fields: dict[str, np.dtype[Any]] = {}
-        if recording.intensity is not None:
+        if self.intensity and recording.intensity is not None:
             fields["intensity"] = recording.intensity.dtype
         if self.sigma:
             fields["sigma_m"] = np.dtype(np.float32)
@@ -142,7 +145,7 @@ def _cloud(
     in_camera = motion is None or (options.sigma and world is not None)
     points = assemble(part, calibration.motion if motion is None or in_camera else motion, compiled=compiled)
     columns: dict[str, RealArray] = {}
-    if part.intensity is not None:
+    if options.intensity and part.intensity is not None:
         columns["intensity"] = np.asarray(part.intensity)
     if options.sigma:
         columns["sigma_m"] = point_sigma(points, part, calibration, part.lidar.range_sigma_m, world)
