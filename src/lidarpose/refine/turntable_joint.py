@@ -197,6 +197,22 @@ def solve_joint(data: JointData, start: JointState, options: JointOptions) -> So
     return replace(full_weight, suspicious=plain)
 
 
+def at_stated_noise(data: JointData, state: JointState) -> Solution:
+    """Information and covariance at a state, with all standard deviations as they are stated: nothing is estimated.
+
+    Raises UndeterminedError as `solve_joint` does.
+    """
+    _require_enough(data)
+    at = linearise(data, state)
+    lines = {
+        kind: LineNoise(1.0, 0.0, np.ones(len(r.residual)), np.ones(lines_of(data, kind).count))
+        for kind, r in at.lines.items()
+    }
+    corners = CornerNoise(1.0, tuple(np.ones(len(c.residual)) for c in at.corners))
+    active = active_parameters(data, ())
+    return _finish(data, at, Noise(corners, lines), active, 0, True, pay=False)
+
+
 COMMON_CORNER_SIGMA_PX = 0.001
 """What the corners of a panel are off by together: as found on rendered boards against the truth (0.0015 px in shift,
 where their scatter alone would leave 0.0008 px)."""
