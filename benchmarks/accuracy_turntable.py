@@ -247,8 +247,8 @@ def rendered_table(seeds: int) -> str:
     lines = [
         f"Rendered sessions, {seeds} seeds over all families of rigs, from images and scans to the pose: root mean "
         f"square errors. Coverage of the 95 % ellipsoid {covered[0]:.2f} inside the arc and {covered[1]:.2f} half a "
-        f"turn away; NEES {nees[:, 0].mean():.1f} and {nees[:, 1].mean():.1f}; verdict good: {verdicts.count('good')} of "
-        f"{seeds}.",
+        f"turn away; NEES {nees[:, 0].mean():.1f} and {nees[:, 1].mean():.1f}; "
+        f"verdict good: {verdicts.count('good')} of {seeds}.",
         "",
         "| method | inside, mm | degrees | half a turn away, mm | degrees |",
         "|---|---|---|---|---|",
