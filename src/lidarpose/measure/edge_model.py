@@ -241,7 +241,9 @@ def fit_edge(
     _, stretch = signed_distance(beams, centre, 1.0)
 
     def round_prior(x: FloatArray) -> FloatArray:
-        return np.where(np.abs(x[:, 2] - radius) < 0.5 * radius, 0.0, -np.inf)
+        # Beyond the beams that were chosen every circle explains them equally badly.
+        off = np.abs(x[:, :3] - [centre[0], centre[1], radius]).max(axis=1)
+        return np.where(off < min(0.5 * radius, 4.0 * reach), 0.0, -np.inf)
 
     shape = np.array([centre[0], centre[1], radius])
     problem = _Problem(beams, stretch, reach, False, inside, dropout, round_prior)
@@ -269,7 +271,8 @@ def fit_straight_edge(
     stretch = np.sqrt(1.0 + beams.slope[:, 0] ** 2 / (1.0 - (beams.slope**2).sum(axis=-1)))
 
     def straight_prior(x: FloatArray) -> FloatArray:
-        return np.asarray(-0.5 * (x[:, 1] / _SLOPE_SIGMA) ** 2)
+        near = np.abs(x[:, 0] - offset) < 4.0 * reach
+        return np.where(near, -0.5 * (x[:, 1] / _SLOPE_SIGMA) ** 2, -np.inf)
 
     problem = _Problem(beams, stretch, reach, True, True, dropout, straight_prior)
     samples = _explore(problem, np.array([offset, 0.0, 0.0]), np.array([0.3 * reach, 0.5 * _SLOPE_SIGMA, 0.0]), seed)
