@@ -18,6 +18,7 @@ GROUND_CLEARANCE_M = 0.04
 MIN_POINTS = 12
 SCREENING_RAD = np.radians(20.0)
 SCREENING_NEIGHBOURS = 24
+FACE_TILT_RAD = np.radians(5.0)
 HARRIS_RADIUS_M = 0.1
 HARRIS_K = 0.04
 
@@ -58,6 +59,8 @@ def ransac_corner(points: FloatArray, sighting: CornerCandidate, *, seed: int, s
         remaining = remaining[np.abs(planes[-1].distance(remaining)) > CLEARANCE * THRESHOLD_M]
     if screening:
         planes = _apart(region, planes)
+        if not _are_the_faces(planes, sighting):
+            return None
     try:
         corner = intersect_three_planes((planes[0], planes[1], planes[2]))
     except ValueError:
@@ -76,6 +79,13 @@ def _apart(points: FloatArray, planes: list[Plane]) -> list[Plane]:
             fitted.append(_refitted(points[chosen], plane))
         planes = fitted
     return planes
+
+
+def _are_the_faces(planes: list[Plane], sighting: CornerCandidate) -> bool:
+    """Whether the planes are the sighted faces, each once: a small face loses to what is left of the large ones."""
+    cosine = np.abs(np.stack([p.normal for p in planes]) @ sighting.normals.T)
+    best = np.argmax(cosine, axis=1)
+    return len(set(best.tolist())) == 3 and bool((cosine.max(axis=1) > np.cos(FACE_TILT_RAD)).all())
 
 
 def _refitted(points: FloatArray, plane: Plane) -> Plane:
