@@ -18,6 +18,7 @@ from lidarpose.model.observation import LeftOut, PlaceFeatures, ScanLine, Stripe
 from lidarpose.model.session import TurntablePlace, TurntableSession
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_run import Deviation, FunctionDeviation, Method, TruthError, TurntableRun
+from lidarpose.workflows.turning_sense import turning_sense
 
 if TYPE_CHECKING:
     from lidarpose.detect.chessboard import BoardDetection
@@ -116,7 +117,7 @@ def calibrate_turntable(
         calibration=calibration,
         estimate=estimate,
         left_out=merge_left_out(observations.left_out, left_out),
-        notes=features.notes,
+        notes=(*features.notes, turning_sense(calibration.motion, session.places[0].turntable_angle_rad)),
     )
 
 
