@@ -140,7 +140,7 @@ CASES: dict[str, tuple[Callable[[], TurntableObservations], str]] = {
     ),
     "ranges scatter by 5 cm": (
         lambda: simulate_observations(RIG, seed=3, stripe_step_px=20.0, range_sigma_m=0.05),
-        "scatter by 5",
+        "ranges scatter",
     ),
     "corners scatter by 3 px": (
         lambda: simulate_observations(RIG, seed=3, stripe_step_px=20.0, corner_sigma_px=3.0),

@@ -141,8 +141,8 @@ class Solution:
     drift
         See `lidarpose.refine.drift`.
     suspicious
-        The solution with lines off by random amounts, where a drift was found in it: what explains the drift is
-        looked for there.
+        The same, with lines and corners taken as independent: what explains a misfit is looked for there, for the
+        misfit itself is not the noise.
     """
 
     data: JointData
@@ -187,13 +187,13 @@ def solve_joint(data: JointData, start: JointState, options: JointOptions) -> So
     _require_enough(data)
     active = active_parameters(data, options.estimate)
     solution = _solve(data, start, active, options.max_iterations, with_places=True)
+    sharp = replace(solution.noise, corners=replace(solution.noise.corners, smooth_factor=1.0))
+    plain = _finish(data, solution.at, sharp, active, solution.iterations, solution.converged, pay=False)
     if solution.drift is None or solution.drift.ratio < _NOT_RANDOM:
-        return solution
+        return replace(solution, suspicious=plain)
     # Lines that drift like this are off by no random amount of their own: with that for a model the corners alone would
     # lead the estimate away. The lines keep their full weight then, and the covariance pays for the drift.
     full_weight = _solve(data, start, active, options.max_iterations, with_places=False)
-    # What would explain the drift is looked for as if lines were independent: the drift itself is not the noise.
-    plain = _finish(data, solution.at, solution.noise, active, solution.iterations, solution.converged, pay=False)
     return replace(full_weight, suspicious=plain)
 
 
@@ -469,10 +469,9 @@ def _update_corners(
         weights = huber_weights(together / factor)
     correction = 1.0 if soft else information_correction(together / factor, weights)
     cuts = np.cumsum([len(each) for each in z])[:-1]
-    smooth = 1.0 if soft else smooth_factor(data.corners, at.corners)
     sigma_px = factor * float(np.median(np.concatenate([c.sigma_px for c in data.corners])))
     # What all corners of a panel share cannot be seen in their residuals; more corners do not average it away.
-    smooth = max(smooth, 1.0 + (len(together) / (2.0 * len(z))) * (COMMON_CORNER_SIGMA_PX / max(sigma_px, 1e-6)) ** 2)
+    smooth = 1.0 + (len(together) / (2.0 * len(z))) * (COMMON_CORNER_SIGMA_PX / max(sigma_px, 1e-6)) ** 2
     return CornerNoise(factor, tuple(np.split(weights, cuts)), correction, smooth)
 
 
@@ -554,6 +553,10 @@ def _finish(
     found = drift(data, moments, {kind: n.line_weights for kind, n in noise.lines.items()})
     factor = found.inflation if found is not None and pay else 1.0
     noise = replace(noise, lines={k: replace(n, neighbour_factor=factor) for k, n in noise.lines.items()})
+    if pay:
+        # Bent corners are paid for in the covariance alone: with less weight they would let the panels drift away.
+        bent = max(noise.corners.smooth_factor, smooth_factor(data.corners, at.corners))
+        noise = replace(noise, corners=replace(noise.corners, smooth_factor=bent))
     equations = normal_equations(data, at, noise, moments)
     covariance, condition, weakest = covariance_and_condition(equations.information[np.ix_(active, active)])
     return Solution(data, at, noise, equations, active, covariance, condition, weakest, iterations, converged, found)
