@@ -33,6 +33,12 @@ def unit(vectors: ArrayLike) -> FloatArray:
     return np.asarray(array / length)
 
 
+def cross3(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross product (3,) of two single vectors (3,); for these numpy's own spends its time on axes."""
+    (p, q, r), (x, y, z) = a.tolist(), b.tolist()
+    return np.array([q * z - r * y, r * x - p * z, p * y - q * x])
+
+
 def angle_between(a: ArrayLike, b: ArrayLike) -> Any:
     """Angle in [0, pi] between vectors (..., 3), accurate near 0 and pi where arccos is not (Kahan)."""
     a_unit, b_unit = unit(a), unit(b)
@@ -52,8 +58,8 @@ def perpendicular_pair(direction: ArrayLike) -> tuple[FloatArray, FloatArray]:
     w = unit(direction)
     helper = np.zeros(3)
     helper[int(np.argmin(np.abs(w)))] = 1.0
-    u = unit(np.cross(helper, w))
-    return u, np.cross(w, u)
+    u = unit(cross3(helper, w))
+    return u, cross3(w, u)
 
 
 def all_finite(arrays: Iterable[ArrayLike]) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidarpose.geometry.arrays import FloatArray, as_float_array
+from lidarpose.geometry.arrays import FloatArray, as_float_array, cross3
 from lidarpose.geometry.lines import Line3
 from lidarpose.geometry.se3 import Pose
 
@@ -64,7 +64,7 @@ class Plane:
 
     def intersect_plane(self, other: Plane) -> Line3:
         """Common line, its direction along ``cross(normal, other.normal)``. Raises ValueError if parallel."""
-        direction = np.cross(self.normal, other.normal)
+        direction = cross3(self.normal, other.normal)
         if np.linalg.norm(direction) < 1e-9:
             raise ValueError("parallel planes have no common line")
         system = np.stack([self.normal, other.normal, direction])

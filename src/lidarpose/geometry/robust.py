@@ -20,8 +20,18 @@ def mad_sigma(values: ArrayLike, *, centred: bool = False) -> float:
     x = np.asarray(values, dtype=np.float64)
     if x.size == 0:
         return float("nan")
-    centre = 0.0 if centred else np.median(x)
-    return float(MAD_TO_SIGMA * np.median(np.abs(x - centre)))
+    centre = 0.0 if centred else _median(x)
+    return MAD_TO_SIGMA * _median(np.abs(x - centre))
+
+
+def _median(values: FloatArray) -> float:
+    """As numpy's, of all values, at a fraction of its overhead; NaN where a value is."""
+    n = values.size
+    # NaN sorts last.
+    ordered = np.partition(values, [(n - 1) // 2, n // 2, n - 1], axis=None)
+    if np.isnan(ordered[-1]):
+        return float("nan")
+    return 0.5 * float(ordered[(n - 1) // 2] + ordered[n // 2])
 
 
 def huber_weights(standardised: ArrayLike, k: float = 1.345) -> FloatArray:

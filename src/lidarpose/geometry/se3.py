@@ -71,19 +71,16 @@ def quaternion_xyzw_from_matrix(rotation: ArrayLike) -> FloatArray:
     R = np.asarray(rotation, dtype=np.float64)
     m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     # Four times the outer product of the quaternion with itself; its largest row loses no digits.
-    squares = np.stack([1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22, 1 + m00 + m11 + m22], -1)
-    xy, xz, yz = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
-    xw, yw, zw = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
-    rows = np.stack(
-        [
-            np.stack([squares[..., 0], xy, xz, xw], -1),
-            np.stack([xy, squares[..., 1], yz, yw], -1),
-            np.stack([xz, yz, squares[..., 2], zw], -1),
-            np.stack([xw, yw, zw, squares[..., 3]], -1),
-        ],
-        -2,
-    )
-    best = np.argmax(squares, axis=-1)
+    rows = np.empty((*R.shape[:-2], 4, 4))
+    rows[..., 0, 0], rows[..., 1, 1] = 1 + m00 - m11 - m22, 1 - m00 + m11 - m22
+    rows[..., 2, 2], rows[..., 3, 3] = 1 - m00 - m11 + m22, 1 + m00 + m11 + m22
+    rows[..., 0, 1] = rows[..., 1, 0] = R[..., 0, 1] + R[..., 1, 0]
+    rows[..., 0, 2] = rows[..., 2, 0] = R[..., 0, 2] + R[..., 2, 0]
+    rows[..., 1, 2] = rows[..., 2, 1] = R[..., 1, 2] + R[..., 2, 1]
+    rows[..., 0, 3] = rows[..., 3, 0] = R[..., 2, 1] - R[..., 1, 2]
+    rows[..., 1, 3] = rows[..., 3, 1] = R[..., 0, 2] - R[..., 2, 0]
+    rows[..., 2, 3] = rows[..., 3, 2] = R[..., 1, 0] - R[..., 0, 1]
+    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
     row = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
     return np.asarray(row / np.linalg.norm(row, axis=-1, keepdims=True))
 

@@ -104,8 +104,7 @@ class Camera:
 
         NaN where the distortion model has no inverse (pixels that no ray of its valid region reaches).
         """
-        distorted = np.linalg.solve(self.K[:2, :2], (np.asarray(pixels, dtype=np.float64) - self.K[:2, 2])[..., None])
-        target = distorted[..., 0]
+        target = (np.asarray(pixels, dtype=np.float64) - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
         ideal = self._first_guess(target)
         for _ in range(50):
             value, J = self._distort(ideal)

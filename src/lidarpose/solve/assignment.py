@@ -13,7 +13,7 @@ alone cannot tell. What can:
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import permutations
 
@@ -28,7 +28,7 @@ from lidarpose.model.observation import LeftOut, PlaceFeatures, PlaceObservation
 from lidarpose.model.targets import Panel
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.solve.assignment_blind import choose_without_stripes
-from lidarpose.solve.light_plane import StripePair, stripe_on_panel, stripe_pair
+from lidarpose.solve.light_plane import StripeOnPanel, StripePair, stripe_pair, stripes_on_panel
 from lidarpose.solve.line_pair import FittedLine, fit_line_pair, fit_scan_line, free_directions
 from lidarpose.solve.panel_pose import PanelPose
 from lidarpose.solve.single_pose import single_pose
@@ -88,6 +88,8 @@ class Assignment:
         "the order given by --first-panel", "all placements of the board" or "no rival".
     figures
         The evidence as numbers, units in the keys.
+    stripe_pairs
+        The light plane and stripes of each place by position, where all points of the stripes were used.
     """
 
     places: tuple[PlaceObservation, ...]
@@ -95,6 +97,7 @@ class Assignment:
     motion: TurntableMotion
     decided_by: str
     figures: Mapping[str, float]
+    stripe_pairs: Mapping[str, StripePair] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,9 +179,10 @@ def assign(
         return _without_stripes(panels, panel_poses, places, first_panel)
     reasons: dict[int, str] = {}
     candidates: list[_Candidate] = []
+    on_panels = _stripes_on_panels(camera, panel_poses, places)
     for k, place in enumerate(places):
         try:
-            candidates += _candidates(camera, panel_poses[place.placement], k, place)
+            candidates += _candidates(panel_poses[place.placement], k, place, on_panels.get(k))
         except ValueError as reason:
             reasons[k] = str(reason)
     angles = np.array([p.turntable_angle_rad for p in places])
@@ -217,10 +221,19 @@ def _without_stripes(
 # --- one place -----------------------------------------------------------------------------------------------------
 
 
-def _candidates(camera: Camera, poses: Sequence[PanelPose], index: int, place: PlaceFeatures) -> list[_Candidate]:
+def _candidates(
+    poses: Sequence[PanelPose],
+    index: int,
+    place: PlaceFeatures,
+    on_panels: tuple[StripeOnPanel, StripeOnPanel] | None,
+) -> list[_Candidate]:
     """Ordered pairs of a place's lines that may be the board. Raises ValueError with the reason if there is none."""
     panels = [Plane.from_pose(p.T_camera_panel) for p in poses]
-    stripes, rays = _stripes(camera, poses, place)
+    if on_panels is None:
+        missing = next(key for key in (0, 1) if not _has_stripe(place, key))
+        raise ValueError(f"no usable stripe on panel {missing + 1}")
+    stripes = stripe_pair((panels[0], panels[1]), on_panels)
+    rays = (on_panels[0].rays_camera, on_panels[1].rays_camera)
     if len(place.lines) < 2:
         raise ValueError(f"the scan shows {len(place.lines)} straight lines; the board needs two")
     fits = [fit_scan_line(line, robust=False) for line in place.lines]
@@ -238,20 +251,30 @@ def _candidates(camera: Camera, poses: Sequence[PanelPose], index: int, place: P
     return found
 
 
-def _stripes(
-    camera: Camera, poses: Sequence[PanelPose], place: PlaceFeatures
-) -> tuple[StripePair, tuple[FloatArray, FloatArray]]:
-    for key in (0, 1):
-        if key not in place.stripes or len(place.stripes[key]) < LEAST_STRIPE_POINTS:
-            raise ValueError(f"no usable stripe on panel {key + 1}")
-    T = [poses[key].T_camera_panel for key in (0, 1)]
-    on = [stripe_on_panel(camera, T[key], _thinned(place.stripes[key])) for key in (0, 1)]
-    pair = stripe_pair((Plane.from_pose(T[0]), Plane.from_pose(T[1])), (on[0], on[1]))
-    return pair, (on[0].rays_camera, on[1].rays_camera)
+def _has_stripe(place: PlaceFeatures, key: int) -> bool:
+    return key in place.stripes and len(place.stripes[key]) >= LEAST_STRIPE_POINTS
+
+
+def _stripes_on_panels(
+    camera: Camera, panel_poses: Mapping[str, Sequence[PanelPose]], places: Sequence[PlaceFeatures]
+) -> dict[int, tuple[StripeOnPanel, StripeOnPanel]]:
+    """Both stripes of each place, by the place's index, where it has both; those of one panel together."""
+    found: dict[int, tuple[StripeOnPanel, StripeOnPanel]] = {}
+    for placement, poses in panel_poses.items():
+        lit = [k for k, p in enumerate(places) if p.placement == placement and _has_stripe(p, 0) and _has_stripe(p, 1)]
+        if lit:
+            first, second = (
+                stripes_on_panel(camera, poses[key].T_camera_panel, [_thinned(places[k].stripes[key]) for k in lit])
+                for key in (0, 1)
+            )
+            found.update(zip(lit, zip(first, second, strict=True), strict=True))
+    return found
 
 
 def _thinned(stripe: StripePoints) -> StripePoints:
     """Some of a stripe's points: enough for a choice."""
+    if len(stripe) <= STRIPE_POINTS:
+        return stripe
     some = np.unique(np.linspace(0, len(stripe) - 1, STRIPE_POINTS).astype(int))
     return StripePoints(stripe.pixels[some], stripe.normals[some], stripe.sigma_px[some])
 
@@ -653,6 +676,7 @@ def _assignment(
 ) -> Assignment:
     support = _support(best)
     assigned = []
+    stripe_pairs = {}
     for k, place in enumerate(places):
         if not support[k]:
             reasons.setdefault(k, "its scan lines do not fit the motion of the other places")
@@ -662,16 +686,18 @@ def _assignment(
         assigned.append(
             PlaceObservation(place.position, place.turntable_angle_rad, place.stripes, lines, place.placement)
         )
+        if all(len(place.stripes[key]) <= STRIPE_POINTS for key in (0, 1)):
+            stripe_pairs[place.position] = candidate.stripes
     angles = np.array([p.turntable_angle_rad for p in assigned])
     _require_places(angles, places, reasons)
     left_out = tuple(LeftOut(f"position {places[k].position}", reason) for k, reason in sorted(reasons.items()))
-    return Assignment(tuple(assigned), left_out, best.motion, decided_by, figures)
+    return Assignment(tuple(assigned), left_out, best.motion, decided_by, figures, stripe_pairs)
 
 
 def _whole(place: PlaceFeatures, candidate: _Candidate, key: int) -> ScanLine:
     """The scan line of a panel with the pieces that detection may have split off it."""
     chosen = place.lines[candidate.lines[key]]
-    fit = fit_scan_line(chosen, robust=False)
+    fit = candidate.fits[key]
     length = float(np.ptp(candidate.stripes.extents_m[key]))
     pieces = [chosen]
     for k, other in enumerate(place.lines):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.geometry.arrays import FloatArray, IntArray, angle_between, unit
+from lidarpose.geometry.arrays import FloatArray, IntArray, angle_between, cross3, unit
 from lidarpose.geometry.planes import Plane, fit_plane, intersect_three_planes
 from lidarpose.geometry.robust import mad_sigma, tukey_weights
 from lidarpose.geometry.se3 import Pose
@@ -94,19 +94,31 @@ def stripe_on_panel(camera: Camera, T_camera_panel: Pose, stripe: StripePoints) 
 
     Pixels that have no ray, or whose ray meets the plane behind the camera, are dropped.
     """
+    return stripes_on_panel(camera, T_camera_panel, [stripe])[0]
+
+
+def stripes_on_panel(camera: Camera, T_camera_panel: Pose, stripes: Sequence[StripePoints]) -> list[StripeOnPanel]:
+    """The same for several stripes, one or more, on one panel: as fast as for one."""
     plane = Plane.from_pose(T_camera_panel)
-    rays = camera.rays(stripe.pixels)
+    rays = camera.rays(np.concatenate([s.pixels for s in stripes]))
     points = plane.intersect_rays(rays)
     # How far the point must move on the panel for its pixel to move by one sigma across the stripe.
     on_panel = T_camera_panel.rotation[:, :2]
     J = camera.project_with_jacobian(points)[1] @ on_panel
     det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-    n = stripe.normals * (stripe.sigma_px / np.where(det == 0.0, np.nan, det))[:, None]
+    sigma_px = np.concatenate([s.sigma_px for s in stripes])
+    n = np.concatenate([s.normals for s in stripes]) * (sigma_px / np.where(det == 0.0, np.nan, det))[:, None]
     x = J[:, 1, 1] * n[:, 0] - J[:, 0, 1] * n[:, 1]
     y = J[:, 0, 0] * n[:, 1] - J[:, 1, 0] * n[:, 0]
     spread = np.column_stack([x, y]) @ on_panel.T
     usable = np.isfinite(points).all(axis=1) & np.isfinite(spread).all(axis=1) & (points[:, 2] > 0.0)
-    return StripeOnPanel(points[usable], spread[usable], rays[usable])
+    found = []
+    last = 0
+    for stripe in stripes:
+        first, last = last, last + len(stripe)
+        use = first + np.flatnonzero(usable[first:last])
+        found.append(StripeOnPanel(points[use], spread[use], rays[use]))
+    return found
 
 
 def fit_light_plane(stripes: Sequence[StripeOnPanel], *, seed: int = 0) -> LightPlane:
@@ -133,7 +145,7 @@ def fit_light_plane(stripes: Sequence[StripeOnPanel], *, seed: int = 0) -> Light
         scale = max(1.0, mad_sigma(standardised, centred=True))
         weight = tukey_weights(standardised / scale)
         refined = fit_plane(points, weight / sigma**2)
-        turned = np.linalg.norm(np.cross(refined.normal, plane.normal))
+        turned = np.linalg.norm(cross3(refined.normal, plane.normal))
         plane = refined
         if turned < 1e-8:
             break
@@ -151,7 +163,7 @@ def stripe_pair(
         If the stripes determine no plane, or the panels are parallel (to a degree).
     """
     light = fit_light_plane(stripes, seed=seed)
-    if np.linalg.norm(np.cross(panel_planes[0].normal, panel_planes[1].normal)) < np.sin(np.deg2rad(1.0)):
+    if np.linalg.norm(cross3(panel_planes[0].normal, panel_planes[1].normal)) < np.sin(np.deg2rad(1.0)):
         raise ValueError("the two panels are parallel")
     E = intersect_three_planes((*panel_planes, light.plane))
     directions, extents = [], []
@@ -227,7 +239,7 @@ def _with_covariance(
     # In the plane, along and across the points' own extent.
     axes = np.linalg.eigh((points - pivot).T @ ((points - pivot) * information[:, None]))[1]
     u = unit(axes[:, 2] - (axes[:, 2] @ plane.normal) * plane.normal)
-    basis = np.stack([u, np.cross(plane.normal, u)])
+    basis = np.stack([u, cross3(plane.normal, u)])
     rows = np.column_stack([(points - pivot) @ basis.T, -np.ones(len(points))])
     chi2 = float(np.sum(information * plane.distance(points) ** 2))
     excess = max(1.0, chi2 / max(1.0, float(weight.sum()) - 3.0))

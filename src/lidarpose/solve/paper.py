@@ -15,7 +15,7 @@ from lidarpose.geometry.se3 import UncertainPose
 from lidarpose.model.camera import Camera
 from lidarpose.model.observation import LeftOut, PanelCorners, PlaceObservation, TurntableObservations
 from lidarpose.model.turntable import TurntableMotion
-from lidarpose.solve.light_plane import stripe_on_panel, stripe_pair
+from lidarpose.solve.light_plane import StripePair, stripe_on_panel, stripe_pair
 from lidarpose.solve.line_pair import fit_line_pair, fit_scan_line
 from lidarpose.solve.panel_pose import PanelPose, panel_pose
 from lidarpose.solve.single_pose import single_pose
@@ -58,7 +58,10 @@ class PaperSolution:
 
 
 def solve_paper(
-    observations: TurntableObservations, *, function: Literal["readings", "circles"] = "readings"
+    observations: TurntableObservations,
+    *,
+    function: Literal["readings", "circles"] = "readings",
+    stripe_pairs: Mapping[str, StripePair] | None = None,
 ) -> PaperSolution:
     """Sections 1 and 2 of the paper.
 
@@ -68,6 +71,9 @@ def solve_paper(
         Stripes and scan lines already assigned to their panels.
     function
         How section 2 is done, see `lidarpose.solve.turntable_function`.
+    stripe_pairs
+        By position, light planes and stripes that were fitted to these observations before (by `assign`); those of
+        other places are fitted here.
 
     Raises
     ------
@@ -87,7 +93,8 @@ def solve_paper(
     left_out: list[LeftOut] = []
     for place in observations.places:
         try:
-            sample = sample_pose(observations, panel_poses[place.placement], place)
+            known = (stripe_pairs or {}).get(place.position)
+            sample = sample_pose(observations, panel_poses[place.placement], place, known)
         except ValueError as reason:
             left_out.append(LeftOut(f"position {place.position}", str(reason)))
             continue
@@ -139,17 +146,24 @@ def board_poses(camera: Camera, corners: Sequence[PanelCorners], placement: str 
 
 
 def sample_pose(
-    observations: TurntableObservations, panel_poses: tuple[PanelPose, ...], place: PlaceObservation
+    observations: TurntableObservations,
+    panel_poses: tuple[PanelPose, ...],
+    place: PlaceObservation,
+    stripes: StripePair | None = None,
 ) -> UncertainPose:
-    """T_camera_lidar at one place (section 1). Raises ValueError with the reason if it cannot be found."""
+    """T_camera_lidar at one place (section 1); `stripes` if they are fitted already.
+
+    Raises ValueError with the reason if it cannot be found.
+    """
     for key in (0, 1):
         if key not in place.stripes or len(place.stripes[key]) < LEAST_STRIPE_POINTS:
             raise ValueError(f"no usable stripe on panel {key + 1}")
         if key not in place.scan_lines or len(place.scan_lines[key]) < LEAST_SCAN_POINTS:
             raise ValueError(f"no usable scan line on panel {key + 1}")
-    poses = [panel_poses[key].T_camera_panel for key in (0, 1)]
-    points = [stripe_on_panel(observations.camera, poses[key], place.stripes[key]) for key in (0, 1)]
-    stripes = stripe_pair((Plane.from_pose(poses[0]), Plane.from_pose(poses[1])), (points[0], points[1]))
+    if stripes is None:
+        poses = [panel_poses[key].T_camera_panel for key in (0, 1)]
+        points = [stripe_on_panel(observations.camera, poses[key], place.stripes[key]) for key in (0, 1)]
+        stripes = stripe_pair((Plane.from_pose(poses[0]), Plane.from_pose(poses[1])), (points[0], points[1]))
     if min(stripes.alpha_rad, np.pi - stripes.alpha_rad) < LEAST_ANGLE_RAD:
         raise ValueError("the two stripes are nearly parallel, so the LiDAR may slide along them")
     lines = fit_line_pair(fit_scan_line(place.scan_lines[0]), fit_scan_line(place.scan_lines[1]), stripes.alpha_rad)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.arrays import FloatArray, cross3
 from lidarpose.geometry.se3 import Pose, UncertainPose, nearest_rotation
 from lidarpose.solve.light_plane import LightPlane, StripePair
 from lidarpose.solve.line_pair import LinePair
@@ -39,7 +39,7 @@ def _across(light: LightPlane, pose: Pose) -> FloatArray:
     middle, u, v = pose.inverse() @ light.pivot, *(pose.rotation.T @ light.basis.T).T
     n = pose.rotation.T @ light.plane.normal
     # The normal turns by w = cross(n, change of n); the plane's shift is given at the pivot, wanted at the LiDAR.
-    turns = np.column_stack([np.cross(n, u), np.cross(n, v), np.zeros(3)])[:2]
+    turns = np.column_stack([cross3(n, u), cross3(n, v), np.zeros(3)])[:2]
     shift = np.array([0.0, 0.0, n[2]]) - np.array([middle[1], -middle[0]]) @ turns
     J = np.vstack([shift, turns])
     return np.asarray(J @ light.covariance @ J.T)
@@ -47,4 +47,4 @@ def _across(light: LightPlane, pose: Pose) -> FloatArray:
 
 def _frame(directions: FloatArray) -> FloatArray:
     """Columns (3, 3): both directions and their cross product."""
-    return np.column_stack([directions[0], directions[1], np.cross(directions[0], directions[1])])
+    return np.column_stack([directions[0], directions[1], cross3(directions[0], directions[1])])

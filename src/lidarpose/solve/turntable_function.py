@@ -293,8 +293,8 @@ def _fit_motion(
     for _ in range(steps):
         e = _residuals(angles, R, t, T_w, T_m)
         J = _motion_jacobian(angles, T_w, T_m)
-        H = np.einsum("nac,nab,nbd->cd", J, information, J, optimize=True)
-        g = np.einsum("nac,nab,nb->c", J, information, e, optimize=True)
+        weighted = np.swapaxes(J, -1, -2) @ information
+        H, g = (weighted @ J).sum(axis=0), (weighted @ e[..., None]).sum(axis=0)[:, 0]
         # The turn about z and the shift along it may be put into either factor: the smallest step leaves it alone.
         root = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
         step = root * np.linalg.lstsq(H * np.outer(root, root), g * root, rcond=1e-11)[0]

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from lidarpose.model.turntable_result import TurntableEstimate
     from lidarpose.refine.turntable import JointOptions
     from lidarpose.refine.turntable_joint import Start
+    from lidarpose.solve.light_plane import StripePair
     from lidarpose.solve.paper import PaperSolution
 
 Step = Callable[[], None]
@@ -90,13 +91,13 @@ def calibrate_turntable(
         If the session does not determine the motion; the message says why, and what to record.
     """
     features = detect_features(session, step=step)
-    observations = assign_lines(session, features, first_panel=first_panel)
+    observations, stripe_pairs = assign_lines(session, features, first_panel=first_panel)
     estimate = None
     samples: Mapping[str, Pose] = {}
     if method == "joint" and not any(place.stripes for place in observations.places):
         start = start_without_stripes(observations)
     else:
-        paper = solve(observations)
+        paper = solve(observations, stripe_pairs)
         start = start_of(paper)
         samples = {position: sample.pose for position, sample in paper.samples.items()}
     if method == "joint":
@@ -206,8 +207,8 @@ def _find_stripes(
 
 def assign_lines(
     session: TurntableSession, features: DetectedFeatures, *, first_panel: int | None = None
-) -> TurntableObservations:
-    """Decide by evidence which scan lines lie on which panels."""
+) -> tuple[TurntableObservations, Mapping[str, StripePair]]:
+    """Decide by evidence which scan lines lie on which panels; with the stripes' fits that this took, by position."""
     from lidarpose.solve.assignment import assign
     from lidarpose.solve.paper import board_poses
 
@@ -216,14 +217,14 @@ def assign_lines(
     panel_poses = {name: board_poses(session.camera, corners[name], name) for name in corners}
     assignment = assign(session.camera, panel_poses, features.places, panels=session.panels, first_panel=first_panel)
     left_out = merge_left_out(features.left_out, assignment.left_out)
-    return replace(unassigned, places=assignment.places, left_out=left_out)
+    return replace(unassigned, places=assignment.places, left_out=left_out), assignment.stripe_pairs
 
 
-def solve(observations: TurntableObservations) -> PaperSolution:
-    """The paper's closed forms (its sections 1 and 2)."""
+def solve(observations: TurntableObservations, stripe_pairs: Mapping[str, StripePair] | None = None) -> PaperSolution:
+    """The paper's closed forms (its sections 1 and 2), with the stripes' fits that are there already."""
     from lidarpose.solve.paper import solve_paper
 
-    return solve_paper(observations)
+    return solve_paper(observations, stripe_pairs=stripe_pairs)
 
 
 def start_of(paper: PaperSolution) -> Start:
