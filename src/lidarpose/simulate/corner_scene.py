@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray, unit
 from lidarpose.geometry.se3 import Pose, exp_so3, rotation_z
 from lidarpose.model.cloud import Cloud
@@ -186,7 +187,12 @@ def _draw_place(
         looks = ((centre - corner) @ target.face_normals.T) / np.linalg.norm(centre - corner)
         if elevation.min() > lowest and elevation.max() < highest and looks.min() > 0.15:
             return corner
-    raise ValueError("the instrument sees the whole target from no place near 2 m")
+    raise InputError(
+        "--lidar",
+        "the instrument sees the whole target from no place near 2 m",
+        expected="a field of view that holds the target",
+        remedy="Choose another instrument, pose or target.",
+    )
 
 
 def _surroundings(
