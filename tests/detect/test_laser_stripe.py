@@ -5,6 +5,7 @@ import pytest
 
 from lidarpose.detect.chessboard import find_panels
 from lidarpose.detect.laser_stripe import StripeFinder
+from lidarpose.detect.stripe_fit import _not_negative
 from lidarpose.simulate.rig import draw_rig, paper_camera
 from lidarpose.simulate.session import SimulationOptions, simulate_session
 
@@ -142,3 +143,14 @@ def test_two_lines_are_refused(two_panels, finder) -> None:
 def test_an_image_of_another_size_is_refused(finder) -> None:
     with pytest.raises(ValueError, match="bright images"):
         finder.find(np.zeros((10, 10), np.uint8))
+
+
+def test_the_noise_model_never_has_a_negative_part() -> None:
+    from scipy.optimize import nnls
+
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        design = rng.random((8, 3)) * [1.0, 50.0, 1e4] / rng.random((8, 1))
+        goal = rng.normal(size=8) + 1.0
+        expected, _ = nnls(design, goal)
+        np.testing.assert_allclose(_not_negative(design, goal), expected, rtol=1e-6, atol=1e-9)

@@ -7,7 +7,7 @@ from lidarpose.geometry.arrays import angle_between, perpendicular_pair, unit
 from lidarpose.geometry.circles import fit_circle2, fit_circle3
 from lidarpose.geometry.lines import Line2, fit_line2
 from lidarpose.geometry.planes import Plane, fit_plane, intersect_three_planes
-from lidarpose.geometry.robust import box_plot_inliers, mad_sigma, ransac
+from lidarpose.geometry.robust import box_plot_inliers, chi2_tail, mad_sigma, ransac
 from lidarpose.geometry.se3 import Pose
 
 
@@ -70,3 +70,20 @@ def test_spread_and_box_plot() -> None:
     x = np.random.default_rng(5).normal(size=2000)
     assert mad_sigma(np.r_[x, [1e9] * 50]) == pytest.approx(1.0, rel=0.1)
     assert list(box_plot_inliers(np.r_[np.zeros(5), 1.0, 2.0, 50.0]))[-1] is np.False_
+
+
+@pytest.mark.parametrize("freedom", [0.7, 1.0, 2.0, 7.5, 80.0, 2500.0])
+def test_the_tail_of_chi_squared_is_that_of_an_independent_library(freedom: float) -> None:
+    from scipy.stats import chi2
+
+    values = freedom + np.sqrt(2.0 * freedom) * np.array([-3.0, -0.9, -0.2, 0.0, 0.3, 1.0, 3.0, 6.0])
+    found = [chi2_tail(float(v), freedom) for v in values]
+    np.testing.assert_allclose(found, chi2.sf(values, freedom), rtol=1e-9, atol=1e-13)
+
+
+@pytest.mark.parametrize("count", [1, 4, 7, 12])
+def test_the_robust_spread_is_the_median_absolute_deviation(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=count)
+    expected = 1.4826022185056018 * np.median(np.abs(values - np.median(values)))
+    assert mad_sigma(values) == pytest.approx(expected, rel=1e-15)
+    assert np.isnan(mad_sigma([*values, np.nan]))

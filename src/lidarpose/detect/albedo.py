@@ -8,6 +8,8 @@ measured on the squares' edges.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -113,9 +115,8 @@ def _ring_centre(index: IntArray, shape: IntArray) -> FloatArray:
 
 @lru_cache(maxsize=1)
 def _erf_table() -> FloatArray:
-    from scipy.special import erf
-
-    return np.asarray(erf(np.linspace(-_ERF_REACH, _ERF_REACH, 2 * _ERF_STEPS + 1)), dtype=np.float32)
+    values = [math.erf(x) for x in np.linspace(-_ERF_REACH, _ERF_REACH, 2 * _ERF_STEPS + 1).tolist()]
+    return np.asarray(values, dtype=np.float32)
 
 
 def soft_square_wave(x: FloatArray, sigma: FloatArray) -> FloatArray:
@@ -236,10 +237,27 @@ def _measure_blur(albedo: PanelAlbedo, image: GrayImage | FloatArray) -> float:
         share = albedo.light_share(grid[:, 0], grid[:, 1], edges[0], edges[1])
         return float(np.minimum(np.abs(share - values), 0.5).mean())
 
-    from scipy.optimize import minimize_scalar
+    return float(np.exp(_lowest(misfit, float(np.log(0.2)), float(np.log(6.0)), 2e-3)))
 
-    best = minimize_scalar(misfit, bounds=(np.log(0.2), np.log(6.0)), method="bounded", options={"xatol": 2e-3})
-    return float(np.exp(best.x))
+
+def _lowest(function: Callable[[float], float], low: float, high: float, tolerance: float) -> float:
+    """Where a function with one minimum is lowest, by golden sections.
+
+    Importing scipy for this would take longer than the whole search.
+    """
+    golden = 0.5 * (math.sqrt(5.0) - 1.0)
+    a, b = high - golden * (high - low), low + golden * (high - low)
+    at_a, at_b = function(a), function(b)
+    while high - low > 2.0 * tolerance:
+        if at_a < at_b:
+            high, b, at_b = b, a, at_a
+            a = high - golden * (high - low)
+            at_a = function(a)
+        else:
+            low, a, at_a = a, b, at_b
+            b = low + golden * (high - low)
+            at_b = function(b)
+    return a if at_a < at_b else b
 
 
 def _edge_pixels(albedo: PanelAlbedo, image: GrayImage | FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

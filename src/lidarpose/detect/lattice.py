@@ -27,6 +27,8 @@ _MOST_SADDLES = 4000
 # Links may deviate from the edges' directions by this much (lens, tilt, noise).
 _LINK_COSINE = np.cos(np.radians(22.0))
 _LEAST_NODES = 9
+# Saddles whose distances are all computed, one by one; more go through a tree.
+_FEW = 3000
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,12 +137,9 @@ def _examine(smooth: FloatArray, pixels: FloatArray, least_contrast: float) -> _
 
 def _link(saddles: _Saddles) -> IntArray:
     """Neighbour (N, 4) of each saddle along +edge 0, +edge 1, -edge 0, -edge 1; -1 where there is none."""
-    from scipy.spatial import cKDTree
-
     pixels = saddles.pixels
-    k = min(14, len(pixels) - 1)
-    nearest = cKDTree(pixels).query(pixels, k=k + 1)
-    distance, index = (np.asarray(table)[:, 1:] for table in nearest)
+    index = _nearest(pixels, min(14, len(pixels) - 1))
+    distance = np.linalg.norm(pixels[index] - pixels[:, None], axis=-1)
     directions = np.concatenate([saddles.edges, -saddles.edges], axis=1)
     towards = (pixels[index] - pixels[:, None]) / distance[..., None]
     cosine = np.einsum("nka,nsa->nsk", towards, directions)
@@ -157,6 +156,17 @@ def _link(saddles: _Saddles) -> IntArray:
     # A link much longer than the one that it continues leads off the board.
     opposite = np.roll(length, 2, axis=1)
     return np.asarray(np.where(length > 1.7 * np.where(np.isfinite(opposite), opposite, np.inf), -1, mutual))
+
+
+def _nearest(pixels: FloatArray, k: int) -> IntArray:
+    """Each pixel's k nearest others (N, k), nearest first."""
+    if len(pixels) <= _FEW:  # faster than a tree, and much faster than importing one
+        points = pixels.astype(np.float32)
+        _, index = cv2.batchDistance(points, points, cv2.CV_32F, normType=cv2.NORM_L2, K=k + 1)
+        return np.asarray(index[:, 1:], dtype=np.int64)
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(pixels).query(pixels, k=k + 1)[1], dtype=np.int64)[:, 1:]
 
 
 def _grow(saddles: _Saddles, neighbours: IntArray) -> list[tuple[IntArray, IntArray]]:

@@ -13,6 +13,7 @@ Arrays are single precision and made once a band: this runs once for each image 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -426,8 +427,6 @@ def _learn_noise(
     residual: FloatArray, level: FloatArray, signal: FloatArray, good: FloatArray, before: tuple[float, float, float]
 ) -> tuple[float, float, float]:
     """Variance as r^2 + g * level + s^2 * signal^2 (all >= 0), from residuals sorted into bins by the signal."""
-    from scipy.optimize import nnls
-
     step = max(good.size // _NOISE_SAMPLES, 1)
     some = np.flatnonzero(good.ravel()[::step]) * step
     if len(some) < 12 * _NOISE_BINS:
@@ -443,8 +442,24 @@ def _learn_noise(
     middle = error.shape[1] // 2
     variance = np.maximum(1.2 * (MAD_TO_SIGMA * np.partition(error, middle, axis=1)[:, middle]) ** 2, 0.05)
     design = np.stack([np.ones(_NOISE_BINS), level.mean(axis=1), (signal**2).mean(axis=1)], axis=1)
-    solution, _ = nnls(design / variance[:, None], np.ones(_NOISE_BINS))
+    solution = _not_negative(design / variance[:, None], np.ones(_NOISE_BINS))
     return (max(float(solution[0]), 0.05), float(solution[1]), float(solution[2]))
+
+
+def _not_negative(design: FloatArray, goal: FloatArray) -> FloatArray:
+    """Least squares with no unknown below zero, for a few unknowns: the best of all choices of those that are zero."""
+    count = design.shape[1]
+    best, least = np.zeros(count), float(goal @ goal)
+    for size in range(count, 0, -1):
+        for free in combinations(range(count), size):
+            found = np.linalg.lstsq(design[:, free], goal, rcond=None)[0]
+            rest = goal - design[:, free] @ found
+            if found.min() >= 0.0 and float(rest @ rest) < least:
+                best, least = np.zeros(count), float(rest @ rest)
+                best[list(free)] = found
+        if size == count and best.any():
+            break
+    return best
 
 
 def _smooth(band: _Band, state: _State) -> _Smooth | str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
@@ -32,6 +33,38 @@ def _median(values: FloatArray) -> float:
     if np.isnan(ordered[-1]):
         return float("nan")
     return 0.5 * float(ordered[(n - 1) // 2] + ordered[n // 2])
+
+
+def chi2_tail(chi2: float, freedom: float) -> float:
+    """Probability of a chi-squared of `freedom` > 0 degrees above `chi2`.
+
+    The incomplete gamma function's series and continued fraction (Abramowitz and Stegun, 6.5.29 and 6.5.31).
+    """
+    a, x = 0.5 * freedom, 0.5 * chi2
+    if x <= 0.0:
+        return 1.0
+    factor = math.exp(a * math.log(x) - x - math.lgamma(a))
+    if x < a + 1.0:
+        term = total = 1.0 / a
+        k = a
+        while term > 1e-16 * total:
+            k += 1.0
+            term *= x / k
+            total += term
+        return 1.0 - factor * total
+    # Lentz's method; the fraction's terms fall from the first on.
+    b = x + 1.0 - a
+    c, d = 1e300, 1.0 / b
+    value = d
+    for k in range(1, 10_000):
+        numerator = k * (a - k)
+        b += 2.0
+        d = 1.0 / (numerator * d + b)
+        c = b + numerator / c
+        value *= c * d
+        if abs(c * d - 1.0) < 1e-15:
+            break
+    return factor * value
 
 
 def huber_weights(standardised: ArrayLike, k: float = 1.345) -> FloatArray:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.robust import chi2_tail
 
 LINE_CORE, LINE_REJECT = 25.0, 49.0
 """A line whose shift and slope have a chi-square (two degrees of freedom) above the first loses weight, and all of it
@@ -113,7 +114,5 @@ def _scoring_step(effects: _Effects, weight: FloatArray, variance: float) -> flo
 
 
 def _significant(effects: _Effects, use: BoolArray, level: float) -> bool:
-    from scipy.special import chdtri
-
     _, square, freedom = effects.standardised(0.0)
-    return bool(square[use].sum() > chdtri(max(float(freedom[use].sum()), 1.0), level))
+    return bool(chi2_tail(float(square[use].sum()), max(float(freedom[use].sum()), 1.0)) < level)
