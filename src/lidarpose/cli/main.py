@@ -46,6 +46,10 @@ _GROUPS: dict[str, tuple[str, dict[str, tuple[str, str]]]] = {
                 "lidarpose.cli.simulate_corners:simulate_corners",
                 "A target of three faces moved from place to place before a 3D LiDAR.",
             ),
+            "scene": (
+                "lidarpose.cli.simulate_scene:simulate_scene",
+                "A sweep recording of boxes, disks and planes of your own.",
+            ),
             "disk": ("lidarpose.cli.simulate_disk:simulate_disk", "A sweep recording of a disk before a background."),
         },
     ),
