@@ -8,7 +8,10 @@ straight follows from it.
 
 from __future__ import annotations
 
+import math
+import sys
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -65,6 +68,16 @@ class Beams:
 
     def __len__(self) -> int:
         return len(self.angle_rad)
+
+    @cached_property
+    def rays(self) -> FloatArray:
+        """Directions (2, N) of the beams."""
+        return np.stack([np.cos(self.angle_rad), np.sin(self.angle_rad)])
+
+    @cached_property
+    def weight_m(self) -> FloatArray:
+        """Range times the root of the sweeps that count (N,): over the noise, an inverse range in units of sigma."""
+        return np.asarray(self.range_m * np.sqrt(np.minimum(self.count, MOST_SWEEPS)))
 
 
 def find_lines(scan: Scan, spec: LidarSpec | None = None) -> tuple[ScanLine, ...]:
@@ -268,10 +281,8 @@ class _Fit:
 
 
 def _columns(beams: Beams, noise: float, first: int, last: int) -> tuple[FloatArray, FloatArray]:
-    r = beams.range_m[first:last]
-    weight = r**2 * np.sqrt(np.minimum(beams.count[first:last], MOST_SWEEPS)) / noise
-    t = beams.angle_rad[first:last]
-    return np.stack([np.cos(t) * weight, np.sin(t) * weight]), weight / r
+    weight = beams.weight_m[first:last] * beams.range_m[first:last] / noise
+    return beams.rays[:, first:last] * weight, beams.weight_m[first:last] / noise
 
 
 def _fit(beams: Beams, noise: float, first: int, last: int, weights: FloatArray | None = None) -> _Fit:
@@ -289,11 +300,12 @@ def _fit(beams: Beams, noise: float, first: int, last: int, weights: FloatArray 
 
 def _solved(A: FloatArray, b: FloatArray) -> FloatArray:
     """The solution (2,) of two linear equations (numpy's own costs ten times as much for so few)."""
-    (p, q), (r, s) = A
+    (p, q), (r, s) = A.tolist()
+    x, y = b.tolist()
     det = p * s - q * r
     if det == 0.0:
-        det = np.finfo(float).tiny
-    return np.asarray(np.array([s * b[0] - q * b[1], p * b[1] - r * b[0]]) / det)
+        det = sys.float_info.min
+    return np.array([(s * x - q * y) / det, (p * y - r * x) / det])
 
 
 def _split(beams: Beams, noise: float, first: int, last: int, curved: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -353,8 +365,7 @@ def _is_curved(beams: Beams, noise: float, first: int, last: int, chi2_two_lines
 
 
 def _points(beams: Beams, first: int, last: int) -> FloatArray:
-    t, r = beams.angle_rad[first:last], beams.range_m[first:last]
-    return np.column_stack([r * np.cos(t), r * np.sin(t)])
+    return (beams.range_m[first:last] * beams.rays[:, first:last]).T
 
 
 def _merged(beams: Beams, noise: float, segments: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -369,21 +380,28 @@ def _merged(beams: Beams, noise: float, segments: list[tuple[int, int]]) -> list
 
 
 def _on_one_line(beams: Beams, noise: float, a: tuple[int, int], b: tuple[int, int]) -> bool:
-    start, end = _points(beams, a[1] - 1, a[1])[0], _points(beams, b[0], b[0] + 1)[0]
-    shorter = min(np.linalg.norm(np.subtract(*_points(beams, *s)[[0, -1]])) for s in (a, b))
     # Windows that see a stray range are lost on both of its sides.
-    if b[0] - a[1] > 2 * WINDOW and np.linalg.norm(end - start) > 0.25 * shorter:
-        return False
+    if b[0] - a[1] > 2 * WINDOW:
+        shorter = min(_distance(beams, s[0], s[1] - 1) for s in (a, b))
+        if _distance(beams, a[1] - 1, b[0]) > 0.25 * shorter:
+            return False
     one, other = _fit(beams, noise, *a), _fit(beams, noise, *b)
-    inside = np.concatenate([np.arange(*a), np.arange(*b)])
     rows, q = _columns(beams, noise, a[0], b[1])
-    rows, q = rows[:, inside - a[0]], q[inside - a[0]]
+    if b[0] > a[1]:
+        inside = np.r_[0 : a[1] - a[0], b[0] - a[0] : b[1] - a[0]]
+        rows, q = rows[:, inside], q[inside]
     normal = rows @ rows.T
     coefficients = _solved(normal, rows @ q)
     coefficients = coefficients + _solved(normal, rows @ (q - coefficients @ rows))
     chi2 = float(np.sum((q - coefficients @ rows) ** 2))
     gain = chi2 - one.chi2 - other.chi2
     return gain < SPLIT_GAIN or gain / len(q) < LEAST_DEVIATION**2
+
+
+def _distance(beams: Beams, i: int, j: int) -> float:
+    """Distance of two beams' points."""
+    (x, y), (p, q) = ((beams.range_m[k] * beams.rays[:, k]).tolist() for k in (i, j))
+    return math.hypot(x - p, y - q)
 
 
 def _without_curves(beams: Beams, noise: float, segments: list[tuple[int, int]]) -> list[tuple[int, int]]:

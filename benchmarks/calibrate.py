@@ -1,0 +1,91 @@
+"""`calibrate` for a turntable session of 87 places, against decoding its images alone on the same cores.
+
+Run by hand: ``python -m benchmarks.calibrate [SESSION]``. Without a session one is simulated and written to a temporary
+folder. The runs are interleaved, and what counts are the ratios of the medians. Decoding is OpenCV's, a thread a core.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from statistics import median
+
+import cv2
+
+from lidarpose.report.turntable_page import turntable_page
+from lidarpose.storage.session import read_turntable_session
+from lidarpose.workflows.turntable import calibrate_turntable
+
+PLACES = 87
+REPEATS = 7
+
+
+def decode(folder: Path) -> None:
+    """Every PNG of the session, read and decoded to grey."""
+    files = sorted(folder.glob("**/*.png"))
+    with ThreadPoolExecutor(os.cpu_count()) as executor:
+        for path, image in zip(files, executor.map(lambda p: cv2.imread(str(p), 0), files), strict=True):
+            if image is None:
+                raise ValueError(f"{path} is no image")
+
+
+def calibrate(folder: Path, *, report: bool) -> None:
+    """What the command does, in a process that has its modules already."""
+    session = read_turntable_session(folder)
+    run = calibrate_turntable(session)
+    if report:
+        turntable_page(run, {name: sources[0].load() for name, sources in session.board_images.items()})
+
+
+def command(folder: Path, *options: str) -> None:
+    """The command itself, in a new process."""
+    with tempfile.TemporaryDirectory() as out:
+        arguments = [sys.executable, "-m", "lidarpose", "calibrate", str(folder), "-o", out, "--quiet", *options]
+        subprocess.run(arguments, check=True, stdout=subprocess.DEVNULL)
+
+
+def simulate(folder: Path) -> None:
+    arguments = [sys.executable, "-m", "lidarpose", "simulate", "turntable", str(folder), "--places", str(PLACES)]
+    subprocess.run([*arguments, "--quiet"], check=True)
+
+
+def measure(folder: Path) -> dict[str, float]:
+    """Median seconds of each way, all of them in turn."""
+    ways: dict[str, Callable[[], None]] = {
+        "decoding the images alone": lambda: decode(folder),
+        "calibrate, modules loaded, no report": lambda: calibrate(folder, report=False),
+        "calibrate, modules loaded, report": lambda: calibrate(folder, report=True),
+        "lidarpose calibrate --no-report": lambda: command(folder, "--no-report"),
+        "lidarpose calibrate": lambda: command(folder),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    calibrate(folder, report=True)
+    for _ in range(REPEATS):
+        for name, way in ways.items():
+            started = time.perf_counter()
+            way()
+            seconds[name].append(time.perf_counter() - started)
+    return {name: median(values) for name, values in seconds.items()}
+
+
+def main() -> None:
+    cv2.setNumThreads(1)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(temporary) / "session"
+        if len(sys.argv) == 1:
+            simulate(folder)
+        found = measure(folder)
+    first = next(iter(found.values()))
+    print(f"{'':40s} {'seconds':>8s} {'ratio':>6s}")
+    for name, value in found.items():
+        print(f"{name:40s} {value:8.2f} {value / first:6.2f}")
+
+
+if __name__ == "__main__":
+    main()
