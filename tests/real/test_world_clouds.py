@@ -68,6 +68,8 @@ def test_a_corridor_from_a_tilted_2d_scanner() -> None:
 
 def test_a_room_from_a_rotating_2d_scanner() -> None:
     points = read_cloud(folder("rot2d_pcl") / "room_scan1.pcd").finite().points.astype(np.float64)
+    # A third of the returns are the scanner's own mount, a curved thing within half a metre.
+    points = points[np.linalg.norm(points, axis=1) > 0.6]
     patches = segment_planes(points, PlaneSearch(from_sensor=True))
     assert np.median(off_square_deg(patches[:5])) < 1.5
     assert off_square_deg(patches[:5]).max() < 3.0
