@@ -42,6 +42,22 @@ format: setup
 gallery: setup
 	$(BIN)/python docs/make_gallery.py
 
+# Accuracy and speed, by hand: nothing here is a test. An hour or two; bench-quick takes minutes.
+bench: setup
+	$(BIN)/python benchmarks/accuracy_turntable.py --runs 500 --write docs/accuracy.md
+	$(BIN)/python -m benchmarks.seed_setup --seeds 10 --write docs/accuracy.md
+	$(BIN)/python benchmarks/accuracy_world.py --output docs/accuracy-world.md
+	$(BIN)/python benchmarks/corner_finding.py
+	$(BIN)/python -m benchmarks.calibrate
+	$(BIN)/python -m benchmarks.detection
+	$(BIN)/python -m benchmarks.assemble
+
+bench-quick: setup
+	$(BIN)/python benchmarks/accuracy_turntable.py --runs 20 --rendered 0
+	$(BIN)/python -m benchmarks.seed_setup --seeds 1 --places 30
+	$(BIN)/python -m benchmarks.calibrate
+	$(BIN)/python -m benchmarks.detection
+
 # Needs uv on the path. The lock names versions and hashes, never an index.
 lock:
 	uv pip compile pyproject.toml --universal --fork-strategy fewest --python-version 3.11 --generate-hashes --extra fast \
