@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     from lidarpose.model.corner_session import CornerSession
     from lidarpose.model.world_run import WorldRun
 
-WORLD_METHODS = ("joint", "paper", "paper-approx", "ransac", "harris")
-
 
 def calibrate_world_session(
     session_folder: Path,
@@ -36,7 +34,7 @@ def calibrate_world_session(
     output
         The folder to write to.
     method
-        One of `WORLD_METHODS`.
+        One of `lidarpose.workflows.world.WORLD_METHODS`.
     estimate_scale
         Overrules the session's own `estimate_scale`, if given.
     want_mm, want_deg
@@ -61,10 +59,10 @@ def calibrate_world_session(
     from lidarpose.storage.atomic import write_text
     from lidarpose.storage.calibration import write_calibration
     from lidarpose.storage.corner_session import read_corner_session, session_provenance, truth_beside
-    from lidarpose.workflows.world import world_run
+    from lidarpose.workflows.world import WORLD_METHODS, world_run
 
-    methods = {name: name for name in WORLD_METHODS}
-    if method not in methods:
+    chosen = next((name for name in WORLD_METHODS if name == method), None)
+    if chosen is None:
         raise InputError("--method", f"is {method!r}", expected="for a corner session: " + ", ".join(WORLD_METHODS))
     session = read_corner_session(session_folder)
     options = {
@@ -78,7 +76,7 @@ def calibrate_world_session(
     with progress("Reading clouds", steps, quiet=quiet or json) as advance:
         run = world_run(
             session,
-            method,  # type: ignore[arg-type]
+            chosen,
             estimate_scale=estimate_scale,
             wishes={k: v for k, v in (("want_mm", want_mm), ("want_deg", want_deg)) if v is not None},
             seed=seed,

@@ -277,13 +277,14 @@ def simulate_corner_session(spec: CornerSceneSpec) -> tuple[CornerSession, Corne
 def _resolve(spec: CornerSceneSpec) -> tuple[Pose, TargetKind, float]:
     if spec.lidar not in INSTRUMENTS:
         raise ValueError(f"no instrument {spec.lidar!r}; known are {', '.join(INSTRUMENTS)}")
+    kind: TargetKind = "cube"
     if isinstance(spec.pose, Pose):
-        pose, kind, ground_m = spec.pose, "cube", 0.0
+        pose, ground_m = spec.pose, 0.0
     elif spec.pose in PAPER_POSES:
         pose, kind, ground_m = PAPER_POSES[spec.pose]
     else:
         raise ValueError(f"no pose {spec.pose!r}; known are {', '.join(PAPER_POSES)}")
-    return pose, spec.target or kind, ground_m if spec.ground_m is None else spec.ground_m  # type: ignore[return-value]
+    return pose, spec.target or kind, ground_m if spec.ground_m is None else spec.ground_m
 
 
 def _cloud(cast: CastScene, spec: CornerSceneSpec, name: str, rng: np.random.Generator) -> MemoryCloud:

@@ -105,10 +105,10 @@ def read_rows(path: Path, offset: int, row: np.dtype[Any], count: int, *, skip: 
     return Cloud(points, fields)
 
 
-def _fill(file: IO[bytes], target: memoryview) -> int:
+def _fill(file: io.FileIO, target: memoryview) -> int:
     """Read until `target` is full or the file ends; how many bytes came."""
     got = 0
-    while got < len(target) and (more := file.readinto(target[got:])):  # type: ignore[attr-defined]
+    while got < len(target) and (more := file.readinto(target[got:])):
         got += more
     return got
 
