@@ -71,7 +71,7 @@ def test_a_wrong_key_in_the_description_is_named(folder: Path) -> None:
 
 
 def test_a_session_is_not_overwritten(folder: Path) -> None:
-    with pytest.raises(InputError, match="already holds a session"):
+    with pytest.raises(InputError, match="already holds a corner session"):
         write_corner_session(folder, read_corner_session(folder))
 
 

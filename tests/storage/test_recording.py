@@ -9,7 +9,8 @@ import pytest
 from lidarpose.errors import InputError
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.scan import LidarSpec
-from lidarpose.storage.recording import read_recording, release_pages, write_recording
+from lidarpose.simulate.disk_scene import rig_motion
+from lidarpose.storage.recording import read_recording, release_pages, write_recording, write_simulated_recording
 
 
 @pytest.fixture
@@ -52,6 +53,21 @@ def test_optional_arrays_may_be_missing(recording: SweepRecording, tmp_path: Pat
     assert again.time_s is None
     assert again.has_reading_per_beam
     assert again.lidar == LidarSpec()
+
+
+def test_nothing_but_a_recording_is_replaced(recording: SweepRecording, tmp_path: Path) -> None:
+    folder = tmp_path / "rec"
+    write_recording(folder, recording)
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="notes"):
+        write_recording(folder, recording)
+    assert (folder / "notes.txt").read_text() == "mine"
+    (folder / "notes.txt").unlink()
+    # Without truth beside it this may be a recording of the world.
+    with pytest.raises(InputError, match="already holds a sweep recording"):
+        write_simulated_recording(folder, recording, rig_motion())
+    write_simulated_recording(folder, recording, rig_motion(), force=True)
+    write_simulated_recording(folder, recording, rig_motion())
 
 
 def cut_short(folder: Path) -> None:

@@ -30,6 +30,7 @@ def simulate_disk(
     beam_step_deg: Annotated[float, Parameter(validator=validators.Number(gte=0.005, lte=2.0))] = 1.0 / 12.0,
     sweep_step_deg: Annotated[float, Parameter(validator=validators.Number(gte=0.005, lte=2.0))] = 0.05,
     seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0,
+    force: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:
     """Simulate a sweep recording of a disk, as in the turntable paper's section 3.2.
 
@@ -68,17 +69,14 @@ def simulate_disk(
         Between sweeps.
     seed
         The same seed gives the same recording.
+    force
+        Replace a recording that no simulation wrote.
     """
-    import json
-
     from lidarpose.cli.console import out as console
-    from lidarpose.model.calibration import TurntableCalibration
     from lidarpose.simulate.disk_scene import DiskScene, disk_pose, rig_motion
     from lidarpose.simulate.disk_scene import simulate_disk as simulate
     from lidarpose.simulate.sweep_scene import BeamModel
-    from lidarpose.storage.atomic import write_text
-    from lidarpose.storage.calibration import transform_entry, write_calibration
-    from lidarpose.storage.recording import write_recording
+    from lidarpose.storage.recording import write_simulated_recording
 
     beam = BeamModel(spot_m=spot_m, shape=spot, mixing=mixing, range_sigma_m=range_sigma_m, dropout=dropout)
     scene = DiskScene(
@@ -95,18 +93,12 @@ def simulate_disk(
     )
     motion = rig_motion()
     recording = simulate(scene, motion, seed=seed)
-    write_recording(out, recording)
-    write_calibration(Path(f"{out}.calibration.json"), TurntableCalibration(motion))
     pose = disk_pose(scene, motion)
     truth = {
         "diameter_mm": 1e3 * diameter_m,
         "centre_m": pose.translation.tolist(),
         "normal": (-pose.rotation[:, 2]).tolist(),
-        "transforms": [
-            transform_entry("camera", "turntable", motion.T_camera_turntable),
-            transform_entry("turntable", "lidar", motion.T_turntable_lidar),
-        ],
     }
-    write_text(Path(f"{out}.truth.json"), json.dumps(truth, indent=2) + "\n")
+    write_simulated_recording(out, recording, motion, truth, force=force)
     sweeps, beams = recording.range_m.shape
     console().print(f"{out}: {sweeps} sweeps of {beams} beams; truth in {out}.truth.json")

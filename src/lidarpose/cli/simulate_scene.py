@@ -34,6 +34,7 @@ def simulate_scene(
     range_sigma_m: Annotated[FiniteFloat, Parameter(validator=validators.Number(gte=0.0, lte=0.5))] = 0.001,
     dropout: Annotated[FiniteFloat, Parameter(validator=validators.Number(gte=0.0, lt=1.0))] = 0.0,
     seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0,
+    force: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:
     """Simulate a sweep recording of boxes, disks and planes that a scene file describes.
 
@@ -42,7 +43,7 @@ def simulate_scene(
     scene
         A scene file (docs/simulator.md): [[disks]], [[boxes]], [[planes]] in the camera's frame, metres.
     out
-        The recording's folder; OUT.calibration.json holds the true calibration.
+        The recording's folder; OUT.truth.json and OUT.calibration.json hold the true poses.
     calibration
         A turntable calibration to place the LiDAR by; otherwise one that looks along the camera's z.
     turntable_deg
@@ -66,14 +67,14 @@ def simulate_scene(
         Share of the beams without return.
     seed
         The same seed gives the same recording.
+    force
+        Replace a recording that no simulation wrote.
     """
     import numpy as np
 
     from lidarpose.cli.console import out as console
-    from lidarpose.model.calibration import TurntableCalibration
     from lidarpose.simulate.sweep_scene import BeamModel, SweepPlan, simulate_sweeps
-    from lidarpose.storage.calibration import write_calibration
-    from lidarpose.storage.recording import write_recording
+    from lidarpose.storage.recording import write_simulated_recording
     from lidarpose.storage.scene import read_scene
 
     surfaces = _surfaces(read_scene(scene))
@@ -85,8 +86,7 @@ def simulate_scene(
         raise InputError("--sweep-step-deg", found, expected=f"at most {_MOST_BEAMS} beams in all")
     beam = BeamModel(spot_m=spot_m, shape=spot, mixing=mixing, range_sigma_m=range_sigma_m, dropout=dropout)
     recording = simulate_sweeps(SweepPlan(motion, np.array(readings), np.array(beams), beam), surfaces, seed=seed)
-    write_recording(out, recording)
-    write_calibration(Path(f"{out}.calibration.json"), TurntableCalibration(motion))
+    write_simulated_recording(out, recording, motion, force=force)
     hits = int(np.isfinite(recording.range_m).sum())
     console().print(f"{out}: {len(readings)} sweeps of {len(beams)} beams, {hits} returns", markup=False)
 

@@ -20,7 +20,7 @@ from lidarpose.model.scan import LidarSpec, Scan
 from lidarpose.model.session import DEFAULT_PLACEMENT, TurntablePlace, TurntableSession
 from lidarpose.model.targets import Panel
 from lidarpose.storage import rosbag
-from lidarpose.storage.atomic import replacing_folder, require_new_folder
+from lidarpose.storage.atomic import require_new_folder
 from lidarpose.storage.bag_messages import (
     ScanMessage,
     camera_of,
@@ -276,8 +276,7 @@ def _recording(recorded: _Recorded, out: Path, options: ImportOptions) -> Import
         np.maximum.accumulate(recorded.scan_s),
         options.lidar,
     )
-    with replacing_folder(out) as temporary:
-        write_recording(temporary, recording)
+    write_recording(out, recording)
     turn = f"{readings.min():.2f} to {readings.max():.2f} degrees"
     moving = "at stops" if stands else "moving: a reading for each beam"
     summary = f"{len(scans)} sweeps of {len(beam_angle_rad)} beams, turntable {turn} ({moving})"

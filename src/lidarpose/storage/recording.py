@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import mmap
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,15 +12,23 @@ import numpy as np
 from numpy.lib import format as npy
 
 from lidarpose.errors import InputError
+from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.recording import RealArray, SweepRecording
 from lidarpose.model.scan import LidarSpec
-from lidarpose.storage.atomic import replacing, write_text
+from lidarpose.model.turntable import TurntableMotion
+from lidarpose.storage.atomic import replacing_folder, restore_folder, write_text
+from lidarpose.storage.calibration import transform_entry, write_calibration
 from lidarpose.storage.documents import Schema, check_format, parse, read_toml
 from lidarpose.storage.npy_header import read_npy_header
 from lidarpose.storage.session import LidarSection
+from lidarpose.storage.session_folder import check_free
+from lidarpose.storage.truth import truth_path
 
 FORMAT = "lidarpose/sweep-recording@1"
 HEAD = "recording.toml"
+
+_ARRAYS = ("turntable_angle_deg", "beam_angle_deg", "range_m", "intensity", "time_s")
+_FILES = {HEAD, *(f"{name}.npy" for name in _ARRAYS)}
 
 # Readings of a turntable and beam angles beyond these are no degrees, ranges beyond no metres of any LiDAR.
 _LARGEST_ANGLE_DEG = 3.6e5
@@ -48,14 +58,7 @@ def read_recording(folder: Path) -> SweepRecording:
         raise InputError(folder, "no such folder", expected="the folder of a sweep recording")
     lidar = _read_head(folder / HEAD)
     arrays: dict[str, RealArray | None] = {
-        name: _map_array(folder / f"{name}.npy", required=required)
-        for name, required in [
-            ("turntable_angle_deg", True),
-            ("beam_angle_deg", True),
-            ("range_m", True),
-            ("intensity", False),
-            ("time_s", False),
-        ]
+        name: _map_array(folder / f"{name}.npy", required=name not in ("intensity", "time_s")) for name in _ARRAYS
     }
     recording = _join(folder, lidar, arrays)
     _check_angles(folder / "turntable_angle_deg.npy", recording.turntable_angle_deg)
@@ -67,10 +70,16 @@ def read_recording(folder: Path) -> SweepRecording:
 
 
 def write_recording(folder: Path, recording: SweepRecording) -> None:
-    """Write a recording; the head comes last, so that an interrupted write is no recording."""
+    """Write a recording as a folder, whole or not at all; an earlier recording there is replaced.
+
+    Raises
+    ------
+    InputError
+        If the folder holds anything but a recording, or cannot be written to.
+    """
     folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(folder, "exists and is no folder", expected="a new folder or one to write into")
+    restore_folder(folder)
+    _check_replaceable(folder)
     arrays: dict[str, Any] = {
         "turntable_angle_deg": np.asarray(recording.turntable_angle_deg, dtype=np.float64),
         "beam_angle_deg": np.asarray(recording.beam_angle_deg, dtype=np.float64),
@@ -78,15 +87,55 @@ def write_recording(folder: Path, recording: SweepRecording) -> None:
         "intensity": recording.intensity,
         "time_s": recording.time_s,
     }
-    (folder / HEAD).unlink(missing_ok=True)
-    for name, array in arrays.items():
-        path = folder / f"{name}.npy"
-        if array is None:
-            path.unlink(missing_ok=True)
-            continue
-        with replacing(path) as temporary, temporary.open("wb") as file:
-            npy.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
-    write_text(folder / HEAD, _head_text(recording.lidar))
+    with replacing_folder(folder) as temporary:
+        for name, array in arrays.items():
+            if array is not None:
+                with (temporary / f"{name}.npy").open("wb") as file:
+                    npy.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
+        write_text(temporary / HEAD, _head_text(recording.lidar))
+
+
+def write_simulated_recording(
+    out: Path,
+    recording: SweepRecording,
+    motion: TurntableMotion,
+    truth: Mapping[str, Any] | None = None,
+    *,
+    force: bool = False,
+) -> None:
+    """Write a simulated recording with OUT.calibration.json and OUT.truth.json beside it.
+
+    Raises
+    ------
+    InputError
+        If the folder holds anything but an earlier simulation; `force` also replaces a recording without truth.
+    """
+    restore_folder(out)
+    check_free(out, FORMAT, force=force, head=HEAD)
+    calibration = Path(f"{out}.calibration.json")
+    # What is left if this run is killed must not belong to another recording.
+    truth_path(out).unlink(missing_ok=True)
+    calibration.unlink(missing_ok=True)
+    write_recording(out, recording)
+    write_calibration(calibration, TurntableCalibration(motion))
+    transforms = [
+        transform_entry("camera", "turntable", motion.T_camera_turntable),
+        transform_entry("turntable", "lidar", motion.T_turntable_lidar),
+    ]
+    document = {**(truth or {}), "transforms": transforms}
+    write_text(truth_path(out), json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+
+def _check_replaceable(folder: Path) -> None:
+    """InputError unless the folder is new, empty, or a recording with nothing else in it."""
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise InputError(folder, "exists and is no folder", expected="the name of a folder to write")
+        others = sorted({path.name for path in folder.iterdir()} - _FILES) if folder.exists() else []
+    except OSError as error:
+        raise InputError(folder, f"cannot be read: {error.strerror or error}") from error
+    if others:
+        raise InputError(folder, f"holds {others[0]!r}, which is no part of a recording", expected="a new folder")
 
 
 def release_pages(recording: SweepRecording) -> None:
