@@ -222,3 +222,46 @@ def test_unknown_options_are_refused() -> None:
         JointOptions(estimate=("speed",))
     with pytest.raises(ValueError, match="positive"):
         JointOptions(want_mm=0.0)
+
+
+@pytest.mark.parametrize(
+    ("blunders", "words"),
+    [
+        (Blunders(black_range_bias_m=3e-3), "black squares"),
+        (Blunders(black_range_bias_m=1e-3), "black squares"),
+        (Blunders(range_offset_m=5e-3), "offset"),
+    ],
+    ids=["black 3 mm", "black 1 mm", "offset 5 mm"],
+)
+def test_an_effect_that_is_named_but_not_estimated_is_in_the_covariance(blunders: Blunders, words: str) -> None:
+    inside, away = [], []
+    for seed in range(6):
+        rig = draw_rig(1 + seed % 3, places=20)
+        middle = float(rig.turntable_angle_rad.mean())
+        estimate = refine(rig, simulate_observations(rig, stripe_step_px=20.0, seed=seed, blunders=blunders))
+        assert estimate.quality.verdict == "doubtful"
+        assert any(words in reason and "standard deviations contain" in reason for reason in estimate.quality.reasons)
+        inside.append(errors(estimate, rig, middle))
+        away.append(errors(estimate, rig, middle + np.pi))
+    # The bound of the 99.9 % ellipsoid; without the effect's share the squares are hundreds to thousands.
+    assert max(e[2] for e in [*inside, *away]) < 22.5
+    # Nor is it more than the effect: the standard deviation stays within some times the error.
+    sigma = 1e3 * np.sqrt(np.trace(estimate.uncertain_pose(middle).centre_covariance()))
+    assert sigma < 5.0 * np.sqrt(np.mean([e[0] ** 2 for e in inside]))
+
+
+def test_a_sound_session_pays_for_no_effect() -> None:
+    rig = draw_rig(2, places=20)
+    estimate = refine(rig, simulate_observations(rig, stripe_step_px=20.0, seed=3))
+    assert estimate.quality.reasons == ()
+    assert errors(estimate, rig, float(rig.turntable_angle_rad.mean()))[0] < 0.6
+
+
+def test_the_noise_of_many_stripe_pixels_is_no_evidence_for_another_focal_length() -> None:
+    rig = draw_rig(3, family="far-axis", places=12)
+    found = []
+    for seed in range(1, 5):
+        estimate = refine_turntable(simulate_observations(rig, seed=seed), rig.motion, rig.T_camera_panel)
+        found += [e.value / e.sigma for e in estimate.extras if e.name == "focal_scale"]
+    # Four of unit variance: the mean's standard deviation is a half.
+    assert abs(np.mean(found)) < 1.6

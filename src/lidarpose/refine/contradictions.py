@@ -19,7 +19,7 @@ from lidarpose.refine.turntable_joint import Solution, all_moments, lines_of, re
 from lidarpose.refine.turntable_model import N_GLOBAL, panel_jacobians
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Explanation:
     """A change that would explain misfit.
 
@@ -35,6 +35,8 @@ class Explanation:
         How far the LiDAR's pose amid the readings would move.
     size
         In the explanation's own unit; of a move the length in m.
+    change : (n,)
+        How the active parameters would change.
     """
 
     key: str
@@ -44,6 +46,7 @@ class Explanation:
     shift_m: float
     turn_rad: float
     size: float
+    change: FloatArray
 
     @property
     def strength(self) -> float:
@@ -166,7 +169,7 @@ def _lags(solution: Solution, terms: _LineTerms) -> Iterator[Explanation]:
         f"scans and stripes of one place disagree by {np.rad2deg(value[0]):+.3f} degrees of the turntable{places}: "
         "scans and stripe images are not of the same places"
     )
-    yield Explanation("scan-lag", text, fall, 1, *_pose_move(solution, change), float(value[0]))
+    yield Explanation("scan-lag", text, fall, 1, *_pose_move(solution, change), float(value[0]), change)
 
 
 def _moves(solution: Solution, terms: _LineTerms) -> Iterator[Explanation]:
@@ -193,12 +196,12 @@ def _move_found(
     if key == "slip":
         size = float(value[0])
         text = f"the turntable slipped or its reading jumped by {np.rad2deg(size):+.3f} degrees {where}"
-        return Explanation(key, text, fall, 1, *_pose_move(solution, change), size)
+        return Explanation(key, text, fall, 1, *_pose_move(solution, change), size, change)
     middle = np.mean([p @ c for p, c in zip(solution.state.panels, solution.data.centres, strict=True)], axis=0)
     shift = float(np.linalg.norm(value[:3] + np.cross(value[3:], middle)))
     turn = float(np.rad2deg(np.linalg.norm(value[3:])))
     text = f"board or camera moved {where}, by about {1e3 * shift:.1f} mm and {turn:.2f} degrees"
-    return Explanation(key, text, fall, 6, *_pose_move(solution, change), shift)
+    return Explanation(key, text, fall, 6, *_pose_move(solution, change), shift, change)
 
 
 def _panel_scales(solution: Solution, terms: _LineTerms) -> Iterator[Explanation]:
@@ -222,7 +225,7 @@ def _panel_scales(solution: Solution, terms: _LineTerms) -> Iterator[Explanation
             f"the squares of panel {number + 1} seem to be {1.0 + value[0]:.3f} times their stated size "
             "(the other panel's held)"
         )
-        yield Explanation("panel-scale", text, fall, 1, *_pose_move(solution, change), float(value[0]))
+        yield Explanation("panel-scale", text, fall, 1, *_pose_move(solution, change), float(value[0]), change)
 
 
 def _tested(

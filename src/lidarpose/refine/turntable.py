@@ -15,6 +15,7 @@ from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_result import ExtraParameter, TurntableEstimate
 from lidarpose.refine.alternatives import duplicates, explain_by_alternative
 from lidarpose.refine.contradictions import explanations
+from lidarpose.refine.named_effect import paid_for, shift_of, strongest_effects, suggested
 from lidarpose.refine.observability import pose_spread, weak_directions, whole_turn
 from lidarpose.refine.stability import leave_places_out
 from lidarpose.refine.turntable_estimate import (
@@ -30,7 +31,7 @@ from lidarpose.refine.turntable_estimate import (
 )
 from lidarpose.refine.turntable_joint import JointOptions, Solution, solve_joint
 from lidarpose.refine.turntable_model import EXTRAS, lay_out, start_state
-from lidarpose.refine.verdict import Evidence, judge, suggested
+from lidarpose.refine.verdict import Evidence, judge
 
 __all__ = ["JointOptions", "refine_turntable"]
 
@@ -126,17 +127,19 @@ def _assemble(
     options: JointOptions,
     refused: Mapping[str, str],
 ) -> TurntableEstimate:
-    data, C, camera = solution.data, outside.covariance[:10, :10], solution.data.camera
-    angles = data.angles_rad
+    data, angles = solution.data, solution.data.angles_rad
     inside_at = np.unique([angles.min(), data.reference_rad, angles.max()])
-    inside = pose_spread(outside.motion, C, inside_at)
     extras = _judged_extras(solution, outside, options, refused, inside_at)
+    effects = strongest_effects(solution, outside, options, extras, explanations(solution.suspicious or solution))
+    stability = leave_places_out(solution, outside)
+    directions = weak_directions(outside.motion, outside.covariance[:10, :10], angles)
+    outside = paid_for(outside, effects)
+    C = outside.covariance[:10, :10]
     noise = noise_estimates(solution)
-    directions = weak_directions(outside.motion, C, angles)
     evidence = Evidence(
         noise=noise,
         range_sigma_m=observations.lidar.range_sigma_m,
-        inside=inside,
+        inside=pose_spread(outside.motion, C, inside_at),
         around=pose_spread(outside.motion, C, whole_turn(data.reference_rad)),
         want_mm=options.want_mm,
         want_deg=options.want_deg,
@@ -144,13 +147,13 @@ def _assemble(
         lines_offered={k: len(n.line_weights) for k, n in solution.noise.lines.items()},
         lines_left_out={k: int((n.line_weights == 0.0).sum()) for k, n in solution.noise.lines.items()},
         extras=extras,
-        stability=leave_places_out(solution, outside),
+        stability=stability,
         directions=directions,
         places=len(observations.places),
         duplicates=duplicates(observations),
         drift=(solution.suspicious or solution).drift,
-        explanations=explanations(solution.suspicious or solution),
-        mirrored_centre_px=(camera.width - 1 - 2.0 * camera.cx, camera.height - 1 - 2.0 * camera.cy),
+        effects=effects,
+        effect_shift=shift_of(outside, effects[0], data.reference_rad) if effects else (0.0, 0.0),
     )
     quality = judge(evidence)
     if quality.verdict == "rejected" or not solution.converged:

@@ -23,11 +23,20 @@ _HOPELESS_M, _HOPELESS_RAD = 0.5, np.deg2rad(30.0)
 
 @dataclass(frozen=True, eq=False)
 class OutsideParameters:
-    """Names, values and covariance in the fixed frames."""
+    """Names, values and covariance in the fixed frames.
+
+    Attributes
+    ----------
+    names, covariance : (n,), (n, n)
+        Of motion, estimated extras and panels.
+    from_inside : (n, n)
+        Derivative by the active internal parameters.
+    """
 
     motion: TurntableMotion
     names: tuple[str, ...]
     covariance: FloatArray
+    from_inside: FloatArray
 
 
 def outside_parameters(solution: Solution) -> OutsideParameters:
@@ -48,7 +57,7 @@ def outside_parameters(solution: Solution) -> OutsideParameters:
         *EXTRAS,
         *(f"panel_{_slot_name(slot)}.{part}" for slot in data.slots for part in _PANEL_PARTS),
     )
-    return OutsideParameters(motion, tuple(names[i] for i in use), J @ solution.covariance @ J.T)
+    return OutsideParameters(motion, tuple(names[i] for i in use), J @ solution.covariance @ J.T, J)
 
 
 def _slot_name(slot: Slot) -> str:
@@ -189,18 +198,36 @@ def tested_extras(solution: Solution, options: JointOptions) -> tuple[ExtraParam
 
 def extra_effect(solution: Solution, outside: OutsideParameters, name: str, value: float) -> tuple[float, float]:
     """How far (m, rad) an extra parameter of this value would move the pose inside the recorded arc."""
+    move = move_of_extra(solution, outside, name, value)[:N_MOTION]
+    spread = pose_spread(outside.motion, np.outer(move, move), _arc(solution))
+    return float(spread.position_m.max()), float(spread.rotation_rad.max())
+
+
+def move_of_extra(solution: Solution, outside: OutsideParameters, name: str, value: float) -> FloatArray:
+    """How the parameters of `outside` (n,) would change with an extra parameter of this value.
+
+    A scale of the readings turns the LiDAR in proportion to the reading, which no motion does: its change is the one
+    that moves the pose alike over the recorded arc.
+    """
     p = N_MOTION + EXTRAS.index(name)
     use = np.asarray(solution.active)
-    moved = -solution.covariance @ solution.equations.information[use, p] * value
-    inside = np.zeros(N_MOTION + 1)
-    inside[:N_MOTION] = moved[:N_MOTION]
+    move = np.asarray(
+        outside.from_inside @ (-solution.covariance @ solution.equations.information[use, p] * value), dtype=np.float64
+    )
     if name == "encoder_scale":
-        inside[N_MOTION] = value
-    move = motion_map(solution.state, outside.motion, solution.data.reference_rad) @ inside
+        by_scale = motion_map(solution.state, outside.motion, solution.data.reference_rad)[:, N_MOTION] * value
+        readings = (1.0 + float(solution.state.extras[0])) * _arc(solution)
+        J = np.concatenate([outside.motion.pose_jacobian(float(r)) for r in readings])
+        twist = outside.motion.T_camera_turntable.adjoint()[:, 5]
+        turned = np.concatenate([twist * r * value for r in readings])
+        move[:N_MOTION] += by_scale + np.linalg.lstsq(J, turned, rcond=1e-9)[0]
+    return move
+
+
+def _arc(solution: Solution) -> FloatArray:
+    """First, middle and last reading."""
     angles = solution.data.angles_rad
-    at = np.array([angles.min(), solution.data.reference_rad, angles.max()])
-    spread = pose_spread(outside.motion, np.outer(move, move), at)
-    return float(spread.position_m.max()), float(spread.rotation_rad.max())
+    return np.array([angles.min(), solution.data.reference_rad, angles.max()])
 
 
 def panel_poses(solution: Solution, observations: TurntableObservations) -> Mapping[str, tuple[Pose | None, ...]]:

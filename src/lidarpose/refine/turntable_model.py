@@ -517,6 +517,8 @@ def stripe_residuals(data: JointData, state: JointState) -> LineResiduals:
     basis[:, 1] = basis[:, 0] * (depth * (ray_x - on_stripe * px_x) - centre[:, 0])
     basis[:, 2] = basis[:, 0] * (depth * (ray_y - on_stripe * px_y) - centre[:, 1])
     basis[:, 3:6] = alpha[:, None] * basis[:, :3]
+    # Of the point on the stripe too: at the measured pixel the focal length would take the noise's square for signal.
+    focal_m, focal_n = focal_m + on_stripe * px_m, focal_n + on_stripe * px_n
     for column, (by_m, by_n) in enumerate(((focal_m, focal_n), (x_m, x_n), (y_m, y_n)), start=6):
         basis[:, column] = basis[:, 0] * depth * (by_m - alpha * by_n)
     to = np.zeros((lines.count, 9, N_GLOBAL + 6))

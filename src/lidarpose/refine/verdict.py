@@ -10,8 +10,8 @@ import numpy as np
 
 from lidarpose.model.calibration import Quality, Verdict
 from lidarpose.model.turntable_result import Direction, ExtraParameter, Kind, NoiseEstimate
-from lidarpose.refine.contradictions import Explanation
 from lidarpose.refine.drift import Drift
+from lidarpose.refine.named_effect import NamedEffect
 from lidarpose.refine.observability import PoseSpread
 from lidarpose.refine.stability import Stability
 
@@ -23,27 +23,6 @@ _PLACE_REJECTED: dict[Kind, float] = {"stripes": 3.0, "ranges": 0.03}
 """The same for what whole lines are off by."""
 _WHAT: dict[Kind, str] = {"corners": "chessboard corners", "stripes": "stripe pixels", "ranges": "ranges"}
 _ORDER: tuple[Verdict, ...] = ("good", "doubtful", "rejected")
-
-EXTRA_WORDS: dict[str, str] = {
-    "encoder_scale": "the turntable's readings seem to be off by a factor",
-    "range_offset_m": "the ranges seem to have an offset",
-    "range_scale": "ranges and board disagree in scale (size of the squares, or unit of the ranges)",
-    "beam_angle_scale": "the beam angles seem to be off by a factor (rounded angular step)",
-    "black_bias_m": "ranges on black squares differ from those on white ones",
-    "focal_scale": "the camera's focal length does not fit the board",
-    "centre_x_px": "the camera's principal point does not fit the board (x)",
-    "centre_y_px": "the camera's principal point does not fit the board (y)",
-}
-_TOLERATED: dict[str, float] = {
-    "encoder_scale": 2e-3,
-    "range_offset_m": 2e-3,
-    "range_scale": 3e-3,
-    "beam_angle_scale": 2e-3,
-    "black_bias_m": 3e-4,
-    "focal_scale": 4e-3,
-    "centre_x_px": 8.0,
-    "centre_y_px": 8.0,
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +45,8 @@ class Evidence:
     duplicates: Sequence[str] = ()
     places: int = 0
     drift: Drift | None = None
-    explanations: Sequence[Explanation] = ()
-    mirrored_centre_px: tuple[float, float] = (0.0, 0.0)
+    effects: Sequence[NamedEffect] = ()
+    effect_shift: tuple[float, float] = (0.0, 0.0)
 
 
 class _Judge:
@@ -91,7 +70,7 @@ def judge(evidence: Evidence) -> Quality:
     for same in evidence.duplicates:
         jury.object(1, same)
     if not evidence.findings:
-        _judge_explanations(jury, evidence)
+        _judge_effect(jury, evidence)
     if not evidence.converged:
         jury.object(1, "the estimate did not converge")
     for kind, noise in evidence.noise.items():
@@ -139,7 +118,6 @@ def _judge_left_out(jury: _Judge, evidence: Evidence) -> None:
 
 
 _DRIFT_DOUBTFUL, _DRIFT_REJECTED = 8.0, 400.0
-_SURE = 5.0
 
 
 def _judge_drift(jury: _Judge, evidence: Evidence) -> None:
@@ -153,52 +131,18 @@ def _judge_drift(jury: _Judge, evidence: Evidence) -> None:
     )
 
 
-def _judge_explanations(jury: _Judge, evidence: Evidence) -> None:
-    """Of the single changes that would explain misfit only the best is named: they resemble each other."""
-    candidates: list[tuple[float, int, str]] = []
-    for extra in evidence.extras:
-        if extra.estimated or not extra.observable or abs(extra.value) <= _SURE * extra.sigma:
-            continue
-        large = abs(extra.value) > _TOLERATED[extra.name]
-        text = f"{EXTRA_WORDS[extra.name]}: {describe_extra(extra)}{_mirror_hint(extra, evidence)}"
-        if not large and not extra.suggested:
-            continue
-        candidates.append(((extra.value / extra.sigma) ** 2 - _price(1), 1 if large else 0, text))
-    for e in evidence.explanations:
-        matters = 1e3 * e.shift_m > 0.25 * evidence.want_mm or np.rad2deg(e.turn_rad) > 0.25 * evidence.want_deg
-        if e.strength > _SURE and matters:
-            candidates.append((e.fall - _price(e.freedom) - _SEARCH_PRICE.get(e.key, 0.0), 1, e.text))
-    if not candidates:
+def _judge_effect(jury: _Judge, evidence: Evidence) -> None:
+    if not evidence.effects:
         return
-    _, level, text = max(candidates)
-    if level:
-        jury.object(level, text)
+    first, *others = evidence.effects
+    shift_m, turn_rad = evidence.effect_shift
+    amount = f"{1e3 * shift_m:.2g} mm and {np.rad2deg(turn_rad):.2g} degrees"
+    paid = f"the pose inside the arc would move by {amount} with it, which the standard deviations contain"
+    nearly = "".join(f"; or, which explains it nearly as well: {other.text}" for other in others)
+    if any(effect.serious for effect in evidence.effects):
+        jury.object(1, f"{first.text}{nearly}; {paid}")
     else:
-        jury.note(f"note: {text}; it can be estimated")
-
-
-_SEARCH_PRICE = {"moved-board": 8.0, "slip": 8.0}
-
-
-def _price(freedom: int) -> float:
-    """What each further number has to earn before it is believed (Schwarz, 1978, with some 300 lines)."""
-    return 5.7 * freedom
-
-
-def _mirror_hint(extra: ExtraParameter, evidence: Evidence) -> str:
-    axis = {"centre_x_px": 0, "centre_y_px": 1}.get(extra.name)
-    if axis is None or abs(evidence.mirrored_centre_px[axis]) < _TOLERATED[extra.name]:
-        return ""
-    near = abs(extra.value - evidence.mirrored_centre_px[axis]) < max(4.0 * extra.sigma, 2.0)
-    return "; just what a mirrored image would show" if near else ""
-
-
-def describe_extra(extra: ExtraParameter) -> str:
-    if extra.name.endswith("_m"):
-        return f"{1e3 * extra.value:+.2f} mm (standard deviation {1e3 * extra.sigma:.2f} mm)"
-    if extra.name.endswith("_px"):
-        return f"{extra.value:+.1f} px (standard deviation {extra.sigma:.1f} px)"
-    return f"{100.0 * extra.value:+.2f} % (standard deviation {100.0 * extra.sigma:.2f} %)"
+        jury.note(f"note: {first.text}{nearly}; it can be estimated; {paid}")
 
 
 def _judge_size(jury: _Judge, evidence: Evidence) -> None:
@@ -280,11 +224,3 @@ def _figures(evidence: Evidence) -> dict[str, Any]:
 
 def _at_half_turn(around: PoseSpread) -> tuple[float, float]:
     return float(around.position_m[0]), float(around.rotation_rad[0])
-
-
-def suggested(extra: ExtraParameter, effect: tuple[float, float], inside: PoseSpread) -> bool:
-    """Do the residuals call for this parameter, and would the pose notice?"""
-    if extra.estimated or not extra.observable or abs(extra.value) <= 5.0 * extra.sigma:
-        return False
-    shift, turn = effect
-    return bool(shift > 0.5 * inside.position_m.max() or turn > 0.5 * inside.rotation_rad.max())
