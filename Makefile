@@ -3,8 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+BENCH_VENV := .venv-bench
+BENCH_STAMP := $(BENCH_VENV)/.installed
+BENCH_PYTHON = $(if $(wildcard $(BENCH_STAMP)),$(BENCH_VENV),$(VENV))/bin/python
 
-.PHONY: setup demo test test-slow check format lock gallery bench bench-quick accuracy-world clean
+.PHONY: setup demo test test-slow check format lock gallery bench bench-quick bench-setup accuracy accuracy-world clean
 
 setup: $(STAMP)
 
@@ -42,27 +45,37 @@ format: setup
 gallery: setup
 	$(BIN)/python docs/make_gallery.py
 
-# Accuracy and speed, by hand: nothing here is a test. An hour or two; bench-quick takes minutes.
-bench: setup
-	$(BIN)/python benchmarks/accuracy_turntable.py --runs 500 --write docs/accuracy.md
-	$(BIN)/python -m benchmarks.seed_setup --seeds 10 --write docs/accuracy.md
-	$(BIN)/python benchmarks/accuracy_world.py --output docs/accuracy-world.md
-	$(BIN)/python benchmarks/corner_finding.py
-	$(BIN)/python -m benchmarks.calibrate
-	$(BIN)/python -m benchmarks.detection
-	$(BIN)/python -m benchmarks.assemble
+# Peers to measure against, in an environment of their own (Open3D brings sixty packages). Benchmarks run without them too.
+bench-setup: $(BENCH_STAMP)
 
+$(BENCH_STAMP): requirements-bench.lock pyproject.toml
+	$(PYTHON) -m venv $(BENCH_VENV)
+	$(BENCH_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement requirements-bench.lock
+	$(BENCH_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $(BENCH_STAMP)
+
+# Accuracy and speed against peers and limits, on an idle machine: docs/benchmarks.md and .json. A quarter of an hour.
+bench: setup
+	$(BENCH_PYTHON) -m benchmarks.run --write
+
+# The same with small sizes, printed only: minutes, to see that all works.
 bench-quick: setup
-	$(BIN)/python benchmarks/accuracy_turntable.py --runs 20 --rendered 0
-	$(BIN)/python -m benchmarks.seed_setup --seeds 1 --places 30
-	$(BIN)/python -m benchmarks.calibrate
-	$(BIN)/python -m benchmarks.detection
+	$(BENCH_PYTHON) -m benchmarks.run --quick
+
+# The long accuracy studies behind docs/accuracy.md; hours. See also accuracy-world.
+accuracy: setup
+	$(BIN)/python -m benchmarks.accuracy_turntable --runs 500 --write docs/accuracy.md
+	$(BIN)/python -m benchmarks.seed_setup --seeds 10 --write docs/accuracy.md
+	$(BIN)/python -m benchmarks.corner_finding
 
 # Needs uv on the path. The lock names versions and hashes, never an index.
 lock:
 	uv pip compile pyproject.toml --universal --fork-strategy fewest --python-version 3.11 --generate-hashes --extra fast \
 	  --group dev --group build --no-emit-index-url --no-emit-find-links --no-annotate --no-header \
 	  --output-file requirements.lock
+	uv pip compile pyproject.toml --universal --fork-strategy fewest --python-version 3.11 --generate-hashes --extra fast \
+	  --group bench --group build --constraints requirements.lock --no-emit-index-url --no-emit-find-links --no-annotate \
+	  --no-header --output-file requirements-bench.lock
 
 clean:
-	rm -rf $(VENV) demo-output .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf $(VENV) $(BENCH_VENV) demo-output .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

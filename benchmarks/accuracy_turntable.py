@@ -1,6 +1,6 @@
 """How accurate the joint estimate is: against the Cramer-Rao bound, and against its own covariance.
 
-    python benchmarks/accuracy_turntable.py --runs 500 --write docs/accuracy.md
+    python -m benchmarks.accuracy_turntable --runs 500 --write docs/accuracy.md
 
 The bound comes from numerical derivatives of a measurement function that shares nothing with the estimator.
 """
@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.limits import CORNER_PX, STEP_PX, STRIPE_PX, motion_bound, pose_limits
 from lidarpose.geometry.arrays import FloatArray
-from lidarpose.geometry.se3 import Pose
-from lidarpose.model.turntable import TurntableMotion
 from lidarpose.refine.turntable import JointOptions, refine_turntable
 from lidarpose.simulate.observations import Blunders, simulate_observations
-from lidarpose.simulate.rig import TurntableRig, draw_rig
+from lidarpose.simulate.rig import Family, TurntableRig, draw_rig
 from lidarpose.solve.paper import solve_paper
 
-CORNER_PX, STRIPE_PX = 0.1, 0.15
 START, END = "<!-- turntable joint estimate: start -->", "<!-- turntable joint estimate: end -->"
 
 
@@ -46,77 +44,6 @@ SETTINGS = (
 )
 
 
-# --- the bound ------------------------------------------------------------------------------------------------------
-
-
-def measurements(rig: TurntableRig, stripe: list[tuple[int, int, FloatArray, FloatArray]]) -> FloatArray:
-    """Corners, stripe offsets and ranges of a rig, each over its standard deviation, straight from geometry."""
-    out = []
-    for poses in rig.T_camera_panel.values():
-        for pose, panel in zip(poses, rig.panels, strict=True):
-            out.append(rig.camera.project(pose @ panel.corners_panel()).ravel() / CORNER_PX)
-    for place, panel, pixels, normals in stripe:
-        pose = rig.T_camera_panel[rig.placement[place]][panel]
-        T = rig.T_camera_lidar(place)
-        n, m = pose.rotation[:, 2], T.rotation[:, 2]
-        along = np.cross(n, m)
-        A = np.array([n, m, along])
-        point = np.linalg.solve(A, [n @ pose.translation, m @ T.translation, 0.0])
-        s = np.linspace(-1.5, 1.5, 601)
-        curve = point + s[:, None] * along / np.linalg.norm(along)
-        curve = curve[curve[:, 2] > 0.3]
-        image = rig.camera.project(curve)
-        # The stripe's image, piece by piece a straight line: where the measured normal crosses it.
-        tangent = np.column_stack([-normals[:, 1], normals[:, 0]])
-        rows = zip(pixels, tangent, normals, strict=True)
-        off = np.array([np.interp(0.0, *_sorted((image - q) @ t, (image - q) @ w)) for q, t, w in rows])
-        out.append(off / (STRIPE_PX / np.sqrt(STEP_PX)))
-    for place in range(len(rig)):
-        for panel in range(len(rig.panels)):
-            T = rig.T_panel_lidar(place, panel)
-            beams = rig.hit[place][panel]  # type: ignore[attr-defined]
-            direction = np.cos(beams)[:, None] * T.rotation[:, 0] + np.sin(beams)[:, None] * T.rotation[:, 1]
-            out.append(-T.translation[2] / direction[:, 2] / rig.range_sigma_m)
-    return np.concatenate(out)
-
-
-STEP_PX = 12.0
-
-
-def _sorted(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    order = np.argsort(x)
-    return x[order], y[order]
-
-
-def moved(rig: TurntableRig, step: FloatArray) -> TurntableRig:
-    """The rig after a step in the ten numbers of the motion and six a panel."""
-    T = Pose.exp(step[:6]) @ rig.motion.T_camera_turntable
-    mount = rig.motion.T_turntable_lidar
-    lidar = Pose(Pose.exp(np.r_[0, 0, 0, step[7:10]]).rotation @ mount.rotation, mount.translation + [step[6], 0, 0])
-    ((name, poses),) = rig.T_camera_panel.items()
-    panels = tuple(Pose.exp(step[10 + 6 * k : 16 + 6 * k]) @ p for k, p in enumerate(poses))
-    other = replace(rig, motion=TurntableMotion(T, lidar), T_camera_panel={name: panels})
-    object.__setattr__(other, "hit", rig.hit)  # type: ignore[attr-defined]
-    return other
-
-
-def bound(rig: TurntableRig) -> FloatArray:
-    """Cramer-Rao bound (10, 10) of the motion, from central differences."""
-    sound = simulate_observations(
-        rig, corner_sigma_px=0.0, stripe_sigma_px=0.0, range_sigma_m=0.0, stripe_step_px=STEP_PX
-    )
-    stripe = [(i, k, s.pixels, s.normals) for i, p in enumerate(sound.places) for k, s in p.stripes.items()]
-    hit = [{k: line.angle_rad for k, line in p.scan_lines.items()} for p in sound.places]
-    object.__setattr__(rig, "hit", hit)
-    n, h = 22, 1e-6
-    J = np.empty((len(measurements(rig, stripe)), n))
-    for p in range(n):
-        step = np.zeros(n)
-        step[p] = h
-        J[:, p] = (measurements(moved(rig, step), stripe) - measurements(moved(rig, -step), stripe)) / (2 * h)
-    return np.linalg.inv(J.T @ J)[:10, :10]
-
-
 # --- the study ------------------------------------------------------------------------------------------------------
 
 
@@ -136,7 +63,7 @@ class Outcome:
 def study(setting: Setting, runs: int, *, stripe_step_px: float = STEP_PX, seed: int = 1) -> tuple[Outcome, Outcome]:
     """Inside the arc, and half a turn away."""
     rig = draw_rig(seed, places=setting.places, range_sigma_m=setting.range_sigma_m)
-    limit = bound(rig)
+    limit = motion_bound(rig)
     middle = float(0.5 * (rig.turntable_angle_rad[0] + rig.turntable_angle_rad[-1]))
     readings = (middle, middle + np.pi)
     rows: list[list[tuple[FloatArray, FloatArray, float]]] = [[], []]
@@ -167,11 +94,7 @@ def summary(
 ) -> Outcome:
     shift, turn = np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
     nees = np.array([r[2] for r in rows])
-    J = rig.motion.pose_jacobian(reading)
-    centre = rig.motion.pose(reading).translation
-    J_centre = J[:3] + np.array([np.cross(J[3:, k], centre) for k in range(10)]).T
-    best_m = np.sqrt(np.trace(J_centre @ limit @ J_centre.T))
-    best_rad = np.sqrt(np.trace(J[3:] @ limit @ J[3:].T))
+    best_m, best_rad = pose_limits(rig, limit, reading)
     rms_m, rms_rad = np.sqrt((shift**2).sum(axis=1).mean()), np.sqrt((turn**2).sum(axis=1).mean())
     both = np.hstack([shift, turn])
     bias = np.abs(both.mean(axis=0) / (both.std(axis=0, ddof=1) / np.sqrt(len(both))))
@@ -209,7 +132,7 @@ def table(runs: int, stripe_step_px: float = STEP_PX) -> str:
     return "\n".join(lines)
 
 
-RENDERED = (
+RENDERED: tuple[Family, ...] = (
     *("paper", "upside-down", "left", "right", "axis-up", "axis-down", "far-axis", "offset-readings"),
     *("tilted-scan-plane", "flat-scan-plane", "few-places", "many-places", "fold-horizontal", "fold-vertical", "mixed"),
     *("axis-in-scan-plane", "paper", "mixed", "few-places", "mixed"),

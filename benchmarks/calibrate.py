@@ -50,12 +50,12 @@ def command(folder: Path, *options: str) -> None:
         subprocess.run(arguments, check=True, stdout=subprocess.DEVNULL)
 
 
-def simulate(folder: Path) -> None:
-    arguments = [sys.executable, "-m", "lidarpose", "simulate", "turntable", str(folder), "--places", str(PLACES)]
+def simulate(folder: Path, places: int = PLACES) -> None:
+    arguments = [sys.executable, "-m", "lidarpose", "simulate", "turntable", str(folder), "--places", str(places)]
     subprocess.run([*arguments, "--quiet"], check=True)
 
 
-def measure(folder: Path) -> dict[str, float]:
+def measure(folder: Path, repeats: int = REPEATS) -> dict[str, float]:
     """Median seconds of each way, all of them in turn."""
     ways: dict[str, Callable[[], None]] = {
         "decoding the images alone": lambda: decode(folder),
@@ -66,7 +66,7 @@ def measure(folder: Path) -> dict[str, float]:
     }
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     calibrate(folder, report=True)
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         for name, way in ways.items():
             started = time.perf_counter()
             way()

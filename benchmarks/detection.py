@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import cv2
@@ -57,7 +58,7 @@ def true_corners(rig: TurntableRig) -> list[np.ndarray]:
 def corner_error(pixels: np.ndarray, truths: list[np.ndarray]) -> float:
     """RMS to the nearest true corners, whatever the order."""
     distances = [np.linalg.norm(pixels[:, None] - truth[None], axis=-1).min(axis=1) for truth in truths]
-    return min(rms(d) for d in distances) / np.sqrt(2.0)
+    return min(rms(d) for d in distances) / float(np.sqrt(2.0))
 
 
 def stripe_error(rig: TurntableRig, place: int, panel: int, points: StripePoints) -> np.ndarray:
@@ -67,7 +68,7 @@ def stripe_error(rig: TurntableRig, place: int, panel: int, points: StripePoints
     share = np.linspace(-0.05, 1.05, 8001)[:, None]
     line = rig.camera.project(rig.T_camera_panel[""][panel] @ (ends[0] + share * (ends[1] - ends[0])))
     nearest = np.argmin(((points.pixels[:, None] - line[None]) ** 2).sum(-1), axis=1)
-    return ((points.pixels - line[nearest]) * points.normals).sum(-1)
+    return np.asarray(((points.pixels - line[nearest]) * points.normals).sum(-1))
 
 
 def rig_panel(rig: TurntableRig, board: BoardDetection, k: int) -> int:
@@ -98,8 +99,8 @@ def stripes(rig: TurntableRig, shots: list[np.ndarray], images: dict[int, np.nda
     for place, image in images.items():
         encoded = cv2.imencode(".png", image)[1]
         for _ in range(REPEATS):
-            decoding.append(seconds(lambda e=encoded: cv2.imdecode(e, cv2.IMREAD_GRAYSCALE)))
-            finding.append(seconds(lambda i=image: finder.find(i)))
+            decoding.append(seconds(partial(cv2.imdecode, encoded, cv2.IMREAD_GRAYSCALE)))
+            finding.append(seconds(partial(finder.find, image)))
         for k, points in finder.find(image).stripes.items():
             error = stripe_error(rig, place, rig_panel(rig, board, k), points)
             errors.append(error)

@@ -1,0 +1,105 @@
+"""The one list of what is measured: name, unit, which way is better, how far two runs may differ, and the target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Better = Literal["lower", "higher"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One figure of the table.
+
+    Attributes
+    ----------
+    key
+        Its name in the JSON, `suite.figure`.
+    what
+        In words, for the table.
+    unit
+        "x" for a ratio.
+    tolerance
+        Two runs on one idle machine differ by less than this share of the value.
+    target
+        At most this where lower is better, at least this where higher is; None where nothing is asked.
+    bound
+        Where the target is missed: what bounds the figure, and what was tried.
+    """
+
+    key: str
+    what: str
+    unit: str
+    tolerance: float
+    target: float | None = None
+    better: Better = "lower"
+    bound: str = ""
+
+    def met(self, value: float) -> bool | None:
+        """Whether a value reaches the target; None without one."""
+        if self.target is None:
+            return None
+        return value <= self.target if self.better == "lower" else value >= self.target
+
+    def agrees(self, first: float, second: float) -> bool:
+        """Whether two runs gave the same figure within the tolerance."""
+        return abs(first - second) <= self.tolerance * max(abs(first), abs(second))
+
+
+METRICS: tuple[Metric, ...] = (
+    # Starting
+    Metric("start.import_s", "`import lidarpose`, warm", "s", 0.5, 0.15),
+    Metric("start.help_s", "`lidarpose --help`, warm", "s", 0.3, 0.2),
+    Metric("start.import_cold_s", "`import lidarpose`, no byte code, files out of the page cache", "s", 0.6),
+    Metric("start.help_cold_s", "`lidarpose --help`, no byte code, files out of the page cache", "s", 0.6),
+    # The turntable's calibration
+    Metric("calibrate.report", "`calibrate`, 87 places, report written, over decoding its images", "x", 0.25, 2.0),
+    Metric("calibrate.plain", "the same without the report", "x", 0.25, 1.3),
+    Metric("calibrate.report_command", "the whole command in a new process, over decoding", "x", 0.25, 2.0),
+    Metric("calibrate.plain_command", "the same with `--no-report`", "x", 0.25, 1.3),
+    # Boards and stripes
+    Metric("boards.s", "both boards of one image", "s", 0.3, 0.1),
+    Metric("boards.error", "RMS error of their corners, over OpenCV's SB with ACCURACY", "x", 0.1, 1.0),
+    Metric("boards.time", "their time, over OpenCV's SB with ACCURACY", "x", 0.3),
+    Metric("stripes.ms", "a stripe image beyond decoding it", "ms", 0.3, 3.0),
+    Metric("stripes.ms_per_megapixel", "the same a megapixel", "ms", 0.3),
+    Metric("stripes.decoding", "a stripe image, over decoding it", "x", 0.3),
+    # Planes
+    Metric("planes.open3d", "Open3D segment_plane at its defaults, 700 k points, over ours", "x", 0.4, 50.0, "higher"),
+    Metric("planes.open3d_1000", "the same with 1000 iterations, over ours", "x", 0.4, None, "higher"),
+    Metric("planes.subsample", "Open3D on a random subsample of 20 k, over ours", "x", 0.4, 5.0, "higher"),
+    Metric("planes.pyransac3d", "pyransac3d at its defaults, 700 k points, over ours", "x", 0.4, None, "higher"),
+    Metric("planes.error", "normals' RMS error, over the best peer's, three like faces", "x", 0.5, 1.0),
+    Metric("planes.error_small", "worst normal with a face of 2 % of the points, over the best peer's", "x", 0.5, 1.0),
+    # Assembling and files
+    Metric("assemble.copy", "assembling 19 M points, over a memory copy of the result", "x", 0.2, 1.0),
+    Metric("assemble.stream", "`scan` to a PLY, over writing the same bytes", "x", 0.4),
+    Metric("assemble.stream_mb", "largest memory of that process", "MB", 0.2),
+    Metric("files.pcd_write", "binary PCD written, over np.save", "x", 0.4, 1.5),
+    Metric("files.pcd_read", "binary PCD read, over np.load", "x", 0.4, 1.5),
+    Metric("files.ply_write", "PLY written, over np.save", "x", 0.4, 3.0),
+    Metric("files.ply_read", "PLY read, over np.load", "x", 0.4, 3.0),
+    Metric("files.laz_write", "LAZ written, over laspy's own", "x", 0.3),
+    Metric("files.laz_read", "LAZ read, over laspy's own", "x", 0.3),
+    # The world
+    Metric("world.reading", "`calibrate` of 120 HDL-32 frames, over reading them", "x", 0.3, 2.0),
+    # Growth
+    Metric("growth.places_s", "exponent of calibrate's time over places", "", 0.3, 1.1),
+    Metric("growth.places_mb", "exponent of its memory over places", "", 0.5, 1.1),
+    Metric("growth.frames_s", "exponent of the world job's time over frames", "", 0.3, 1.1),
+    Metric("growth.frames_mb", "exponent of its memory over frames", "", 0.5, 1.1),
+    Metric("growth.points_s", "exponent of plane segmentation's time over points", "", 0.3, 1.1),
+    Metric("growth.points_mb", "exponent of its memory over points", "", 0.3, 1.1),
+    # Accuracy, on simulated observations
+    Metric("turntable.joint_mm", "joint estimate's centre, over the Cramer-Rao bound", "x", 0.15, 1.1),
+    Metric("turntable.joint_deg", "its rotation, over the Cramer-Rao bound", "x", 0.15, 1.1),
+    Metric("turntable.paper_mm", "closed form's centre, over the Cramer-Rao bound", "x", 0.2),
+    Metric("turntable.peer_mm", "best method of the literature's centre, over the Cramer-Rao bound", "x", 0.2),
+    Metric("corner.joint_deg", "world pose's rotation, one frame a place, over the Cramer-Rao bound", "x", 0.25, 1.3),
+    Metric("corner.joint_mm", "its position, over the Cramer-Rao bound", "x", 0.25, 1.3),
+    Metric("corner.paper_mm", "the corner paper's method from the same frames", "x", 0.4),
+    Metric("corner.peer_mm", "best peer's position from the same frames", "x", 0.4),
+)
+
+BY_KEY = {metric.key: metric for metric in METRICS}

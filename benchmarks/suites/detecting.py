@@ -1,0 +1,97 @@
+"""Boards and stripes in simulated images of the turntable paper's geometry: time and error, beside OpenCV's."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import cv2
+import numpy as np
+
+from benchmarks.detection import corner_error, rig_panel, sector_with_accuracy, stripe_error, true_corners
+from benchmarks.report import Effort, Report, Table
+from benchmarks.timing import interleaved
+from lidarpose.detect.chessboard import find_panels
+from lidarpose.detect.laser_stripe import StripeFinder
+from lidarpose.simulate.rig import TurntableRig, draw_rig
+from lidarpose.simulate.session import simulate_session
+
+STRIPE_IMAGES = 5
+Image = np.ndarray
+
+
+def run(effort: Effort) -> Report:
+    boards, stripes, errors = [], [], []
+    megapixels = 0.0
+    for seed in range(effort.pick(4, 1)):
+        rig = draw_rig(seed)
+        session = simulate_session(rig).session
+        shots = [source.load() for source in session.board_images[""]]
+        places = np.linspace(0, len(rig) - 1, STRIPE_IMAGES).astype(int)
+        sources = {int(k): session.places[k].stripe_image for k in places}
+        images = {k: source.load() for k, source in sources.items() if source is not None}
+        megapixels = shots[0].size / 1e6
+        boards.append(_boards(rig, shots[0], effort.pick(5, 1)))
+        stripe, error = _stripes(rig, shots, images, effort.pick(5, 1))
+        stripes.append(stripe)
+        errors.append(error)
+    ours_s, theirs_s, ours_px, theirs_px = np.median(np.array(boards), axis=0)
+    finding, decoding = np.median(np.array(stripes), axis=0)
+    stripe_px = float(np.mean(np.abs(np.concatenate(errors))))
+    figures = {
+        "boards.s": float(ours_s),
+        "boards.error": float(ours_px / theirs_px),
+        "boards.time": float(ours_s / theirs_s),
+        "stripes.ms": 1e3 * float(finding),
+        "stripes.ms_per_megapixel": 1e3 * float(finding) / megapixels,
+        "stripes.decoding": float(finding / decoding),
+    }
+    rows = [
+        ["lidarpose", 1e3 * float(ours_s), f"{ours_px:.4f}"],
+        ["OpenCV SB, ACCURACY", 1e3 * float(theirs_s), f"{theirs_px:.4f}"],
+    ]
+    about = (
+        "Both boards of one image, the first painted over for the second where OpenCV looks; medians over the seeds."
+    )
+    lines = [[f"{1e3 * finding:.2f}", f"{1e3 * decoding:.2f}", f"{stripe_px:.3f}"]]
+    return Report(
+        figures,
+        [
+            Table("Both boards of an image", ["detector", "ms", "RMS error of a coordinate, px"], rows, about),
+            Table("Stripes", ["finding them, ms an image", "decoding the PNG, ms", "mean error, px"], lines),
+        ],
+    )
+
+
+def _boards(rig: TurntableRig, image: Image, repeats: int) -> tuple[float, float, float, float]:
+    """Seconds and RMS error in pixels, ours and OpenCV's."""
+    times = interleaved(
+        {"ours": lambda: find_panels([image], rig.panels), "theirs": lambda: sector_with_accuracy(image, rig)}, repeats
+    )
+    truths = true_corners(rig)
+    mine = [corner_error(c.pixels, truths) for c in find_panels([image], rig.panels).corners]
+    sector = [corner_error(pixels, truths) for pixels in sector_with_accuracy(image, rig)]
+    return times["ours"], times["theirs"], _rms(mine), _rms(sector)
+
+
+def _rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values else float("nan")
+
+
+def _stripes(
+    rig: TurntableRig, shots: list[Image], images: dict[int, Image], repeats: int
+) -> tuple[tuple[float, float], np.ndarray]:
+    """Median seconds an image of finding its stripes and of decoding its PNG, and all errors in pixels."""
+    board = find_panels(shots, rig.panels)
+    finder = StripeFinder(board, shots)
+    finding, decoding, errors = [], [], []
+    for place, image in images.items():
+        encoded = cv2.imencode(".png", image)[1]
+        found = finder.find(image)
+        times = interleaved(
+            {"find": partial(finder.find, image), "decode": partial(cv2.imdecode, encoded, cv2.IMREAD_GRAYSCALE)},
+            repeats,
+        )
+        finding.append(times["find"])
+        decoding.append(times["decode"])
+        errors += [stripe_error(rig, place, rig_panel(rig, board, k), p) for k, p in found.stripes.items()]
+    return (float(np.median(finding)), float(np.median(decoding))), np.concatenate(errors)

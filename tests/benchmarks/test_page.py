@@ -1,0 +1,88 @@
+"""The measuring house itself: the list, the page, the comparison, the limits. Nothing here is timed."""
+
+import pytest
+from benchmarks.limits import motion_bound, pose_limits
+from benchmarks.metrics import BY_KEY, METRICS, Metric
+from benchmarks.page import markdown, page
+from benchmarks.report import Curve, Report, Table
+from benchmarks.run import SUITES, compare
+from benchmarks.timing import exponent, interleaved
+
+from lidarpose.simulate.rig import draw_rig
+
+
+def results(value: float) -> dict[str, object]:
+    report = Report(
+        {"start.help_s": value},
+        [Table("Starting", ["process", "s"], [["lidarpose", 0.1234], ["open3d", None]])],
+        [Curve("drawn", "Drawn", "size", "s", [1.0, 10.0], {"ours": [0.1, 1.0], "theirs": [float("nan"), 3.0]})],
+    )
+    machine = {"cores": 2, "versions": {"Python": "3.11"}}
+    return {"machine": machine, "quick": False, "suites": {"starting": report.as_json()}}
+
+
+def test_every_metric_has_its_own_name_and_a_tolerance() -> None:
+    assert len(BY_KEY) == len(METRICS)
+    assert all(0.0 < m.tolerance < 1.0 and m.what for m in METRICS)
+    assert len(set(SUITES)) == len(SUITES)
+
+
+def test_a_target_is_met_on_its_own_side() -> None:
+    low, high = Metric("a", "a", "s", 0.1, 2.0), Metric("b", "b", "x", 0.1, 2.0, "higher")
+    assert (low.met(1.9), low.met(2.1), high.met(1.9), high.met(2.1)) == (True, False, False, True)
+    assert Metric("c", "c", "s", 0.1).met(1.0) is None
+
+
+def test_the_page_says_what_was_met_missed_not_measured_and_not_installed() -> None:
+    met, missed = page(results(0.1)), page(results(0.3))
+    assert "| `lidarpose --help`, warm | 0.1 s | at most 0.2 s | met | 30 % |" in met
+    assert "**missed**" not in met
+    assert "| `lidarpose --help`, warm | 0.3 s | at most 0.2 s | **missed** | 30 % |" in missed
+    assert "not measured" in met
+    assert "| open3d | not installed |" in met
+    assert "images/bench-drawn.svg" in met
+
+
+def test_two_runs_are_compared_within_the_tolerance() -> None:
+    assert compare(results(0.1), results(0.12)) == []
+    (line,) = compare(results(0.1), results(0.2))
+    assert line.startswith("start.help_s: 0.1 before, 0.2 now")
+
+
+def test_a_drawing_is_well_formed() -> None:
+    from xml.etree import ElementTree
+
+    from benchmarks.drawing import svg
+
+    curve = Curve("n", "A < B", "x", "y", [1.0, 10.0, 100.0], {"one & two": [1.0, 2.0, float("nan")]})
+    root = ElementTree.fromstring(svg(curve))
+    assert len(root.findall(".//{http://www.w3.org/2000/svg}circle")) == 2
+
+
+def test_ways_are_interleaved_and_a_slow_one_stops() -> None:
+    order: list[str] = []
+    times = interleaved({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 3)
+    assert order == ["a", "b"] * 3
+    assert set(times) == {"a", "b"}
+    order.clear()
+    interleaved({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 3, budget_s=0.0)
+    assert order == ["a", "b"]
+
+
+def test_exponents_of_powers() -> None:
+    assert exponent([1, 2, 4], [3, 12, 48]) == pytest.approx(2.0)
+
+
+def test_a_table_in_markdown() -> None:
+    assert markdown(["a", "b"], [[1, 0.12345]]) == ["| a | b |", "|---|---|", "| 1 | 0.123 |"]
+
+
+def test_the_bound_falls_with_more_data_and_without_noise() -> None:
+    few, many = draw_rig(1, places=6), draw_rig(1, places=24)
+    middle = float(few.turntable_angle_rad.mean())
+    limits = [pose_limits(rig, motion_bound(rig), middle)[0] for rig in (few, many)]
+    # Four times the places: nearly half the standard deviation; corners are the same.
+    assert 0.45 < limits[1] / limits[0] < 0.8
+    more = draw_rig(1, places=6, placements=3)
+    with_stripe, without = (pose_limits(more, motion_bound(more, with_stripe=s), middle)[0] for s in (True, False))
+    assert without > 2.0 * with_stripe
