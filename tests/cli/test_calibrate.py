@@ -190,3 +190,29 @@ def test_exact_scans_are_no_obstacle(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert run(["calibrate", str(session), "-o", str(tmp_path / "out"), "--json", "--no-report"]) == 0
     error = json.loads(capsys.readouterr().out)["error_against_truth"]["arc"]
     assert error["centre_mm"]["largest"] < 0.05
+
+
+def test_what_the_user_sees_on_his_rig_is_compared(
+    simulated_session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["calibrate", str(simulated_session), "-o", str(tmp_path), "--json", "--no-report"]
+    assert run(command) == 0
+    note = json.loads(capsys.readouterr().out)["notes"][-1]
+    words = note.split("--beams-turn ")[1].split()
+    beams, table = words[0], words[2]
+    other = {"clockwise": "anticlockwise", "anticlockwise": "clockwise"}[beams.split("-from-")[0]]
+    wrong = f"{other}-from-{beams.split('-from-')[1]}"
+    assert run([*command, "--beams-turn", beams, "--table-turns", table]) == 0
+    assert json.loads(capsys.readouterr().out)["verdict"] == "good"
+    assert run([*command, "--beams-turn", wrong, "--table-turns", table]) == 1
+    document = json.loads(capsys.readouterr().out)
+    assert document["verdict"] == "rejected"
+    assert "written in reverse" in document["reasons"][0]
+
+
+def test_an_offset_of_all_beam_angles_is_explained_not_estimated(
+    simulated_session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["calibrate", str(simulated_session), "-o", str(tmp_path), "--estimate", "beam-angle-offset"]
+    assert run(command) == 2
+    assert "turn of the LiDAR about its own z axis" in capsys.readouterr().err

@@ -9,13 +9,22 @@ from cyclopts import Parameter
 
 from lidarpose.cli.options import Json, PositiveFloat, Quiet
 from lidarpose.errors import InputError, RejectedError
+from lidarpose.model.sense import Sense, StatedSense
 
 if TYPE_CHECKING:
     from lidarpose.model.calibration import Quality
     from lidarpose.model.turntable_run import TruthError, TurntableRun
 
 Methods = Literal["joint", "paper", "paper-approx", "ransac", "harris"]
-Extra = Literal["range-offset", "range-scale", "black-bias", "beam-angle-scale", "encoder-scale", "focal-scale"]
+Extra = Literal[
+    "range-offset",
+    "range-scale",
+    "black-bias",
+    "beam-angle-scale",
+    "beam-angle-offset",
+    "encoder-scale",
+    "focal-scale",
+]
 _IN_METRES = ("range-offset", "black-bias")
 
 
@@ -28,6 +37,8 @@ def calibrate(
     first_panel: Annotated[Literal[1, 2] | None, Parameter(group="Turntable sessions")] = None,
     estimate: Annotated[tuple[Extra, ...], Parameter(negative=(), group="Turntable sessions")] = (),
     any_order: Annotated[bool, Parameter(negative=(), show_default=False, group="Turntable sessions")] = False,
+    beams_turn: Annotated[Sense | None, Parameter(group="Turntable sessions")] = None,
+    table_turns: Annotated[Sense | None, Parameter(group="Turntable sessions")] = None,
     estimate_scale: Annotated[bool, Parameter(negative=(), show_default=False, group="Corner sessions")] = False,
     want_mm: PositiveFloat | None = None,
     want_deg: PositiveFloat | None = None,
@@ -53,8 +64,15 @@ def calibrate(
         where the data cannot tell.
     estimate
         Further parameters of the instrument to estimate; each is tested for being observable first.
+        beam-angle-offset is refused with the reason: it is a turn of the LiDAR about its own z, which is estimated.
     any_order
         Accept turntable readings that are equal or go back and forth.
+    beams_turn
+        How the beam turns on your rig as beam angles grow, and where that is seen from: above (the image's upper
+        edge), the camera, or the right of the image. Most LiDARs that stand upright: anticlockwise-from-above. A
+        result that contradicts it is rejected: scans in reverse, or a LiDAR upside down, show in no residual.
+    table_turns
+        The same for the turntable as its readings grow: negated readings show in no residual either.
     estimate_scale
         Estimate the scale between the LiDAR's metres and the world's.
     want_mm
@@ -80,11 +98,20 @@ def calibrate(
         raise InputError(session / "session.toml", f"is {found!r}", field="format", expected=expected)
     if method not in ("joint", "paper"):
         raise InputError("--method", f"{method!r} is for corner sessions", expected="joint or paper")
+    if "beam-angle-offset" in estimate:
+        raise InputError(
+            "--estimate beam-angle-offset",
+            "cannot be told from a turn of the LiDAR about its own z axis, which every estimate contains: adding the "
+            "same angle to all beams and turning the LiDAR back by it gives the same points",
+            remedy="Leave it out: the result is right for beam angles as the scans state them",
+        )
     options = {
         "method": method,
         "first_panel": first_panel,
         "estimate": list(estimate),
         "any_order": any_order,
+        "beams_turn": beams_turn,
+        "table_turns": table_turns,
         "want_mm": want_mm,
         "want_deg": want_deg,
     }
@@ -142,6 +169,7 @@ def _calibrate_turntable(folder: Path, options: dict[str, Any], *, quiet: bool) 
             method=options["method"],
             first_panel=None if first_panel is None else first_panel - 1,
             options=JointOptions(estimate=tuple(_parameter_name(extra) for extra in options["estimate"]), **wishes),
+            stated=StatedSense(options["beams_turn"], options["table_turns"]),
             provenance=provenance("calibrate", folder, session_files(folder, session), options),
             step=advance,
         )

@@ -15,10 +15,12 @@ from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose, log_so3
 from lidarpose.model.calibration import Quality, TurntableCalibration
 from lidarpose.model.observation import LeftOut, PlaceFeatures, ScanLine, StripePoints, TurntableObservations
+from lidarpose.model.sense import StatedSense
 from lidarpose.model.session import TurntablePlace, TurntableSession
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_run import Deviation, FunctionDeviation, Method, TruthError, TurntableRun
-from lidarpose.workflows.turning_sense import turning_sense
+from lidarpose.workflows.reversed_scans import describe_reversed, doubt_reversed, reversed_part, reversed_scans
+from lidarpose.workflows.turning_sense import check_sense, compared, turning_sense
 
 if TYPE_CHECKING:
     from lidarpose.detect.chessboard import BoardDetection
@@ -65,6 +67,7 @@ def calibrate_turntable(
     method: Method = "joint",
     first_panel: int | None = None,
     options: JointOptions | None = None,
+    stated: StatedSense | None = None,
     provenance: Mapping[str, Any] | None = None,
     step: Step | None = None,
 ) -> TurntableRun:
@@ -80,6 +83,8 @@ def calibrate_turntable(
         The user's hint: the panel (index 0 or 1) on which the scan line of smaller beam angle lies.
     options
         Of the joint estimate.
+    stated
+        How beams and table turn, as the user sees it on his rig; a result that contradicts it is rejected.
     step
         Called after each place.
 
@@ -91,7 +96,10 @@ def calibrate_turntable(
         If the session does not determine the motion; the message says why, and what to record.
     """
     features = detect_features(session, step=step)
-    observations, stripe_pairs = assign_lines(session, features, first_panel=first_panel)
+    try:
+        observations, stripe_pairs = assign_lines(session, features, first_panel=first_panel)
+    except UndeterminedError as error:
+        raise _with_reversed_named(error, session, features, first_panel) from None
     estimate = None
     samples: Mapping[str, Pose] = {}
     if method == "joint" and not any(place.stripes for place in observations.places):
@@ -107,7 +115,10 @@ def calibrate_turntable(
     else:
         calibration = TurntableCalibration(paper.motion, quality=paper_quality(paper), provenance=provenance or {})
         left_out = paper.left_out
-    calibration = replace(calibration, quality=doubted(calibration.quality, features, observations))
+    calibration = replace(
+        calibration,
+        quality=checked(calibration, session, features, observations, start[1], estimate, stated or StatedSense()),
+    )
     return TurntableRun(
         method=method,
         session=session,
@@ -119,6 +130,59 @@ def calibrate_turntable(
         estimate=estimate,
         left_out=merge_left_out(observations.left_out, left_out),
         notes=(*features.notes, turning_sense(calibration.motion, session.places[0].turntable_angle_rad)),
+    )
+
+
+def checked(
+    calibration: TurntableCalibration,
+    session: TurntableSession,
+    features: DetectedFeatures,
+    observations: TurntableObservations,
+    panel_poses: Mapping[str, Sequence[Pose | None]],
+    estimate: TurntableEstimate | None,
+    stated: StatedSense,
+) -> Quality | None:
+    """The verdict after a look at what the estimate never saw: places left out, and what the user says of his rig."""
+    quality = doubted(calibration.quality, features, observations)
+    kept = {place.position for place in observations.places}
+    suspects = [place.position for place in session.places if place.position not in kept]
+    if estimate is not None:
+        groups = [group for group in estimate.residuals if group.kind == "ranges" and not group.weights.any()]
+        suspects += [group.position for group in groups if group.position is not None]
+    known = {name: [p for p in found if p is not None] for name, found in panel_poses.items()}
+    found = reversed_scans(session, calibration.motion, known, suspects)
+    if not found and quality is not None and quality.verdict == "rejected":
+        found = _reversed_part(session, features, None)
+    quality = doubt_reversed(quality, found)
+    readings = [place.turntable_angle_rad for place in session.places]
+    return compared(quality, check_sense(calibration.motion, readings, stated))
+
+
+def _reversed_part(session: TurntableSession, features: DetectedFeatures, first_panel: int | None) -> tuple[str, ...]:
+    """Scans that run the other way round in a session that has no solution as a whole."""
+
+    def solve_part(positions: Sequence[str]) -> tuple[TurntableMotion, Mapping[str, Sequence[Pose]]]:
+        part = replace(features, places=tuple(p for p in features.places if p.position in positions))
+        observations, stripe_pairs = assign_lines(session, part, first_panel=first_panel)
+        paper = solve(observations, stripe_pairs)
+        return paper.motion, {n: [p.T_camera_panel for p in found] for n, found in paper.panel_poses.items()}
+
+    if not any(place.stripes for place in features.places):
+        return ()
+    return reversed_part(session, [place.position for place in features.places], solve_part)
+
+
+def _with_reversed_named(
+    error: UndeterminedError, session: TurntableSession, features: DetectedFeatures, first_panel: int | None
+) -> UndeterminedError:
+    """The error, or the one that names the scans whose reversal causes it."""
+    found = _reversed_part(session, features, first_panel)
+    if not found:
+        return error
+    return UndeterminedError(
+        f"The scans contradict each other: {describe_reversed(found)}",
+        remedy="Mend these files (negate their beam angles, or reverse their ranges) and calibrate again",
+        details=(error.what,),
     )
 
 
