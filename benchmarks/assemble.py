@@ -76,6 +76,30 @@ def in_memory(sweeps: int, beams: int, repeats: int) -> dict[str, Any]:
     }
 
 
+_ONE_SHOT = """
+import sys, time
+from benchmarks.assemble import MOTION, recording
+points, beams, way = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+source = recording(points // beams, beams)
+begin = time.perf_counter()
+from lidarpose.measure.assemble import assemble
+assemble(source, MOTION, compiled={"numpy": False, "compiled": True, "default": None}[way])
+print(time.perf_counter() - begin)
+"""
+
+
+def one_shot(points: int, beams: int, repeats: int = 3) -> list[float | None]:
+    """Seconds of assembling once in a new process: by NumPy, compiled, and as the package chooses by itself."""
+    times: dict[str, list[float]] = {"numpy": [], "compiled": [], "default": []}
+    if not has_compiler():
+        del times["compiled"]
+    for _ in range(repeats):
+        for way, values in times.items():
+            command = [sys.executable, "-c", _ONE_SHOT, str(points), str(beams), way]
+            values.append(float(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout))
+    return [median(times[way]) if way in times else None for way in ("numpy", "compiled", "default")]
+
+
 def streamed(points: int, beams: int, repeats: int) -> dict[str, Any]:
     """`lidarpose scan` to a PLY in processes of its own, against writing the same bytes; largest memory in MB."""
     with tempfile.TemporaryDirectory() as folder:

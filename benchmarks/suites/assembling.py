@@ -1,0 +1,39 @@
+"""Assembling a cloud against copying it, and streaming one to a PLY against writing the same bytes."""
+
+from __future__ import annotations
+
+from benchmarks.assemble import in_memory, one_shot, streamed
+from benchmarks.report import Effort, Report, Table
+
+
+def run(effort: Effort) -> Report:
+    sweeps, beams = effort.pick(6000, 600), 3240
+    memory = in_memory(sweeps, beams, effort.pick(9, 3))
+    stream = streamed(effort.pick(50_000_000, 2_000_000), beams, effort.pick(2, 1))
+    rates = memory["million_points_per_s"]
+    # Without numba the NumPy way is what a user has.
+    best = max(rate for name, rate in rates.items() if name != "copy")
+    figures = {
+        "assemble.copy": rates["copy"] / best,
+        "assemble.stream": stream["ratio"],
+        "assemble.stream_mb": stream["memory_mb"],
+    }
+    rows: list[list[object]] = [[name, rate, rates["copy"] / rate] for name, rate in rates.items()]
+    first = memory["first_compiled_call_s"]
+    text = (
+        f"{memory['points']} points in memory, float32, both on all cores. The first compiled call of a process, "
+        f"numba's import and its kernels from the disk included: {first:.2f} s."
+        if first is not None
+        else f"{memory['points']} points in memory, float32; numba is not installed."
+    )
+    shots = [[points, *one_shot(points, beams)] for points in (effort.pick(5_000_000, 500_000), sweeps * beams)]
+    about = (
+        "A new process that makes up a recording and assembles it once: seconds beyond making it up, imports included."
+    )
+    return Report(
+        figures,
+        [
+            Table("Assembling", ["way", "million points a second", "time over a copy"], rows, text),
+            Table("One-shot runs", ["points", "NumPy, s", "compiled, s", "by itself, s"], shots, about),
+        ],
+    )

@@ -1,0 +1,75 @@
+"""How time and memory grow with the work: places, frames, points; exponents by least squares over the logarithms."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from statistics import median
+
+from benchmarks.calibrate import simulate
+from benchmarks.report import Curve, Effort, Report, Table
+from benchmarks.timing import exponent, in_child
+from lidarpose.simulate.corner_scene import CornerSceneSpec, simulate_corner_session
+from lidarpose.storage.corner_session import write_corner_session
+
+SIZES = {
+    "places": (11, 22, 44, 87),
+    "frames": (12, 30, 60, 120),
+    "points": (60_000, 200_000, 700_000, 2_000_000, 5_000_000),
+    "assembled": (1_000_000, 4_000_000, 16_000_000),
+    "written": (300_000, 1_500_000, 7_500_000),
+}
+WORK = {
+    "places": "`calibrate`, turntable, places",
+    "frames": "`calibrate`, world, frames",
+    "points": "three planes of a cloud, points",
+    "assembled": "assembling in memory, points",
+    "written": "a PLY written, points",
+}
+
+
+def run(effort: Effort) -> Report:
+    sizes = SIZES if not effort.quick else {"places": (6, 12), "frames": (6, 12), "points": SIZES["points"][:2]}
+    with tempfile.TemporaryDirectory() as temporary:
+        turntable, world = Path(temporary) / "turntable", Path(temporary) / "world"
+        simulate(turntable, sizes["places"][-1])
+        session, _ = simulate_corner_session(CornerSceneSpec(pose="1", frames=sizes["frames"][-1] // 6, seed=1))
+        write_corner_session(world, session)
+        sessions = {"places": turntable, "frames": world}
+        # Sizes in turn, and all of them again: a slow minute falls on all alike.
+        found: dict[tuple[str, int], list[dict[str, float]]] = {}
+        for _ in range(effort.pick(3, 1)):
+            for name, values in sizes.items():
+                for size in values:
+                    one = in_child("benchmarks.growing", name, str(size), str(sessions.get(name, ".")))
+                    found.setdefault((name, size), []).append(one)
+    figures: dict[str, float] = {}
+    rows: list[list[object]] = []
+    curves = []
+    for name, values in sizes.items():
+        seconds = [median(one["seconds"] for one in found[name, size]) for size in values]
+        memory = [median(one["megabytes"] for one in found[name, size]) for size in values]
+        both = exponent(values, seconds), exponent(values, memory)
+        if name in ("places", "frames", "points"):
+            figures |= {f"growth.{name}_s": both[0], f"growth.{name}_mb": both[1]}
+        rows.append(
+            [WORK[name], f"{values[0]} to {values[-1]}", seconds[-1], f"{both[0]:.2f}", memory[-1], f"{both[1]:.2f}"]
+        )
+        curves.append(
+            Curve(
+                f"growth-{name}",
+                f"Growth: {WORK[name]}",
+                WORK[name].rpartition(", ")[2],
+                "seconds, and MB beside them",
+                values,
+                {"seconds": seconds, "MB above the input": memory},
+            )
+        )
+    columns = ["work", "sizes", "s at the last", "exponent", "MB at the last", "exponent"]
+    return Report(figures, [Table("Growth", columns, rows, _TEXT)], curves)
+
+
+_TEXT = (
+    "Each size in a process of its own, after a small one of the same kind; memory is how far the process rises above "
+    "where it stood with its input in place (the turntable's and the world's input are files)."
+)
