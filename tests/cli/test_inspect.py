@@ -39,3 +39,40 @@ def test_people_get_lines_of_text(simulated_session: Path, capsys: pytest.Captur
     text = capsys.readouterr().out
     assert "camera: 1624 x 1234" in text
     assert "weak: " in text
+
+
+def test_the_geometry_tells_beforehand_what_the_calibration_will_know(
+    simulated_session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["inspect", str(simulated_session), "--json"]) == 0
+    before = json.loads(capsys.readouterr().out)
+    assert run(["calibrate", str(simulated_session), "-o", str(tmp_path), "--json", "--no-report"]) == 0
+    after = json.loads(capsys.readouterr().out)
+    for expected, found in zip(before["expected_sigma"], after["sigma"], strict=True):
+        assert expected["angle_deg"] == pytest.approx(found["angle_deg"])
+        assert 0.5 < expected["centre_mm"] / found["centre_mm"] < 1.5
+        assert 0.5 < expected["rotation_deg"] / found["rotation_deg"] < 1.5
+    assert all({"what", "mm", "deg", "angle_deg", "remedy"} <= set(weak) for weak in before["weak"])
+
+
+def test_further_recordings_are_weighed(simulated_session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["inspect", str(simulated_session), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    now = document["expected_sigma"][1]["centre_mm"]
+    found = {r["what"].split(" (")[0]: r["inside"]["centre_mm"] for r in document["remedies"]}
+    # Four times the measurements halve what the noise of stripes and ranges does; the board's corners are the same.
+    assert 0.45 * now < found["four times the places over the same arc"] < 0.9 * now
+    assert found["a second placement of the board"] < now
+    assert "twice the arc" in found
+
+
+def test_a_contradiction_to_the_rig_is_a_problem_before_calibrating(
+    simulated_session: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["inspect", str(simulated_session), "--json"]) == 0
+    beams = json.loads(capsys.readouterr().out)["sense"].split("--beams-turn ")[1].split()[0]
+    turn, _, view = beams.partition("-from-")
+    wrong = f"{'clockwise' if turn == 'anticlockwise' else 'anticlockwise'}-from-{view}"
+    assert run(["inspect", str(simulated_session), "--json", "--beams-turn", wrong]) == 0
+    problems = json.loads(capsys.readouterr().out)["problems"]
+    assert any("written in reverse" in problem for problem in problems)

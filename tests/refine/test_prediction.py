@@ -30,3 +30,19 @@ def test_what_would_stay_open_is_named_beforehand() -> None:
     same = replace(rig, turntable_angle_rad=np.full(5, rig.turntable_angle_rad[0]))
     with pytest.raises(UndeterminedError, match="axis"):
         predict_uncertainty(rig.camera, rig.panels, rig.T_camera_panel, rig.motion, same.turntable_angle_rad)
+
+
+def test_placements_can_be_seen_from_readings_of_their_own() -> None:
+    rig = draw_rig(3, places=8)
+    (poses,) = rig.T_camera_panel.values()
+    both = {"a": poses, "b": poses}
+    angles = rig.turntable_angle_rad
+
+    def sigma(**how: object) -> float:
+        found = predict_uncertainty(rig.camera, rig.panels, both, rig.motion, angles, **how)  # type: ignore[arg-type]
+        return float(found.inside.position_m.max())
+
+    halves = sigma(placements=["a"] * 4 + ["b"] * 4)
+    assert sigma() < 0.8 * halves
+    with pytest.raises(ValueError, match="argument"):
+        sigma(placements=["a"])

@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from lidarpose.cli.options import Json, Quiet
 from lidarpose.errors import InputError, UndeterminedError
+from lidarpose.model.sense import Sense, StatedSense
 
 if TYPE_CHECKING:
     from lidarpose.model.session import TurntableSession
@@ -20,11 +21,15 @@ def inspect(
     /,
     *,
     any_order: Annotated[bool, Parameter(negative=(), show_default=False)] = False,
+    beams_turn: Sense | None = None,
+    table_turns: Sense | None = None,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Say what is there, what is missing, and what will be badly determined.
 
+    Of a turntable session the standard deviations come from the geometry alone: where board and LiDAR stand, and which
+    readings were recorded. With them comes what would be weak, where, and what further recordings would bring.
     Nothing is written. The exit status is 1 if the session does not determine the pose.
 
     Parameters
@@ -33,6 +38,10 @@ def inspect(
         The session's folder, turntable or corner.
     any_order
         Accept turntable readings that are equal or go back and forth.
+    beams_turn
+        How the beam turns on your rig as beam angles grow, and where that is seen from; see `calibrate`.
+    table_turns
+        The same for the turntable as its readings grow.
     """
     from lidarpose.storage.corner_session import CORNER_SESSION_FORMAT
     from lidarpose.storage.session import SESSION_FORMAT, session_format
@@ -41,7 +50,9 @@ def inspect(
     if found == CORNER_SESSION_FORMAT:
         _inspect_corners(session, json=json)
     elif found == SESSION_FORMAT:
-        _inspect_turntable(session, any_order=any_order, json=json, quiet=quiet)
+        _inspect_turntable(
+            session, any_order=any_order, stated=StatedSense(beams_turn, table_turns), json=json, quiet=quiet
+        )
     else:
         expected = f'"{SESSION_FORMAT}" or "{CORNER_SESSION_FORMAT}"'
         raise InputError(session / "session.toml", f"is {found!r}", field="format", expected=expected)
@@ -62,14 +73,14 @@ def _inspect_corners(folder: Path, *, json: bool) -> None:
         console.print(f"  - {warning}", markup=False)
 
 
-def _inspect_turntable(folder: Path, *, any_order: bool, json: bool, quiet: bool) -> None:
+def _inspect_turntable(folder: Path, *, any_order: bool, stated: StatedSense, json: bool, quiet: bool) -> None:
     from lidarpose.cli.console import out, print_json, progress
     from lidarpose.storage.session import read_turntable_session
     from lidarpose.workflows.turntable_inspection import inspect_turntable
 
     session = read_turntable_session(folder, any_order=any_order)
     with progress("images and scans", len(session.places), quiet=quiet or json) as advance:
-        inspection = inspect_turntable(session, step=advance)
+        inspection = inspect_turntable(session, stated=stated, step=advance)
     if json:
         print_json(_document(session, inspection))
     else:
@@ -101,6 +112,15 @@ def _document(session: TurntableSession, inspection: TurntableInspection) -> dic
             {"what": d.name, "angle_deg": d.angle_deg, "mm": d.sigma_mm, "deg": d.sigma_deg, "remedy": d.remedy}
             for d in inspection.weak
         ],
+        "remedies": [
+            {
+                "what": r.what,
+                "inside": {"centre_mm": r.inside_mm, "rotation_deg": r.inside_deg},
+                "half_a_turn_away": {"centre_mm": r.half_turn_mm, "rotation_deg": r.half_turn_deg},
+            }
+            for r in inspection.remedies
+        ],
+        "sense": inspection.sense,
         "problems": list(inspection.problems),
         "left_out": [{"what": item.what, "reason": item.reason} for item in inspection.left_out],
     }
@@ -117,13 +137,19 @@ def _lines(session: TurntableSession, inspection: TurntableInspection) -> list[s
         f"scan lines at {inspection.places_with_lines}, {inspection.places_used} places usable",
     ]
     lines += [
-        f"expected sigma at {angle:8.2f} deg: {centre:7.3f} mm {rotation:8.4f} deg"
+        f"expected sigma, from the geometry, at {angle:8.2f} deg: {centre:7.3f} mm {rotation:8.4f} deg"
         for angle, centre, rotation in inspection.expected_sigma
     ]
     lines += [
         f"weak: {d.name}: {d.sigma_mm:.3f} mm, {d.sigma_deg:.4f} deg at {d.angle_deg:.0f} deg. {d.remedy}"
         for d in inspection.weak[:3]
     ]
+    lines += [
+        f"would be with {r.what}: {r.inside_mm:.3f} mm {r.inside_deg:.4f} deg amid the readings, "
+        f"{r.half_turn_mm:.3f} mm {r.half_turn_deg:.4f} deg half a turn away"
+        for r in inspection.remedies
+    ]
+    lines += [f"sense: {inspection.sense}"] if inspection.sense else []
     lines += [f"problem: {problem}" for problem in inspection.problems]
     lines += [f"left out: {item.what}: {item.reason}" for item in inspection.left_out[:20]]
     if len(inspection.left_out) > 20:

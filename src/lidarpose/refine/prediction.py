@@ -51,30 +51,37 @@ def predict_uncertainty(
     noise: ExpectedNoise | None = None,
     *,
     with_stripe: bool = True,
+    placements: Sequence[str] | None = None,
 ) -> PredictedUncertainty:
     """What a joint estimate would know, from rough poses of the panels, a rough motion and the readings.
 
     Parameters
     ----------
     panel_poses
-        T_camera_panel by placement of the board; every placement is seen from all readings.
+        T_camera_panel by placement of the board.
     with_stripe
         False for a laser that the camera does not see.
+    placements
+        The placement that is seen at each reading; unless given, every placement from all readings.
 
     Raises
     ------
     UndeterminedError
         If the motion would be left open; the message says which and what to record.
+    ValueError
+        If `placements` and `angles_rad` differ in number.
     """
     expected = noise or ExpectedNoise()
     corners = {
         name: tuple(_corners(camera, panel, pose, expected) for panel, pose in zip(panels, poses, strict=True))
         for name, poses in panel_poses.items()
     }
+    if placements is None:
+        stops = [(name, float(angle)) for name in panel_poses for angle in angles_rad]
+    else:
+        stops = [(name, float(angle)) for name, angle in zip(placements, angles_rad, strict=True)]
     places = [
-        _place(camera, panels, name, poses, motion, float(angle), expected, with_stripe)
-        for name, poses in panel_poses.items()
-        for angle in angles_rad
+        _place(camera, panels, name, panel_poses[name], motion, angle, expected, with_stripe) for name, angle in stops
     ]
     observations = TurntableObservations(camera, tuple(panels), corners, tuple(places))
     data = lay_out(observations)
