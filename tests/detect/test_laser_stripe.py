@@ -153,4 +153,5 @@ def test_the_noise_model_never_has_a_negative_part() -> None:
         design = rng.random((8, 3)) * [1.0, 50.0, 1e4] / rng.random((8, 1))
         goal = rng.normal(size=8) + 1.0
         expected, _ = nnls(design, goal)
-        np.testing.assert_allclose(_not_negative(design, goal), expected, rtol=1e-6, atol=1e-9)
+        found = _not_negative(design[None], goal[None])[0]
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)

@@ -24,7 +24,7 @@ import numpy as np
 
 from lidarpose.detect.albedo import measure_albedo
 from lidarpose.detect.chessboard import BoardDetection
-from lidarpose.detect.stripe_fit import fit_stripe
+from lidarpose.detect.stripe_fit import StripeFit, fit_stripes
 from lidarpose.detect.stripe_search import PanelView, find_line, has_line
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.image import GrayImage
@@ -69,21 +69,33 @@ class StripeFinder:
 
     def find(self, image: GrayImage) -> StripeDetection:
         """Stripe points on every panel in an image of the same size as the bright ones (ValueError if not)."""
-        if image.shape != self._shape:
-            raise ValueError(f"the stripe image has {image.shape} pixels, the bright images have {self._shape}")
-        stripes: dict[int, StripePoints] = {}
-        problems: list[LeftOut] = []
+        return self.find_in([image])[0]
+
+    def find_in(self, images: Sequence[GrayImage]) -> list[StripeDetection]:
+        """The same for several images at once, which takes a fraction of the time."""
+        for image in images:
+            if image.shape != self._shape:
+                raise ValueError(f"the stripe image has {image.shape} pixels, the bright images have {self._shape}")
+        stripes: list[dict[int, StripePoints]] = [{} for _ in images]
+        problems: list[list[LeftOut]] = [[] for _ in images]
         for k, view in enumerate(self._views):
-            line = find_line(view, image)
-            if isinstance(line, str):
-                problems.append(LeftOut(f"stripe on panel {k + 1}", line))
-                continue
-            fit = fit_stripe(view, image, line, self._limit)
-            if isinstance(fit, str):
-                problems.append(LeftOut(f"stripe on panel {k + 1}", fit))
-                continue
-            stripes[k] = fit.points
-        return StripeDetection(stripes, tuple(problems))
+            for i, fit in enumerate(_fits(view, images, self._limit)):
+                if isinstance(fit, str):
+                    problems[i].append(LeftOut(f"stripe on panel {k + 1}", fit))
+                else:
+                    stripes[i][k] = fit.points
+        return [StripeDetection(found, tuple(lost)) for found, lost in zip(stripes, problems, strict=True)]
+
+
+def _fits(view: PanelView, images: Sequence[GrayImage], limit: float) -> list[StripeFit | str]:
+    """The stripe on one panel in each image, or why there is none."""
+    lines = [find_line(view, image) for image in images]
+    seen = [i for i, line in enumerate(lines) if not isinstance(line, str)]
+    fits = fit_stripes(view, [images[i] for i in seen], [line for line in lines if not isinstance(line, str)], limit)
+    found: list[StripeFit | str] = [line if isinstance(line, str) else "" for line in lines]
+    for i, fit in zip(seen, fits, strict=True):
+        found[i] = fit
+    return found
 
 
 def _combine(images: Sequence[GrayImage]) -> FloatArray:

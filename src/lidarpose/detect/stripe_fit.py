@@ -7,18 +7,21 @@ light dark squares send back are common to all. Gauss and Newton's method, all p
 elimination of the others. The noise's variance, r^2 + g * level + (s * signal)^2 (reading, shots, speckle), is learnt
 from the residuals.
 
-Arrays are single precision and made once a band: this runs once for each image and panel, in about a millisecond.
+The images of one panel are fitted several at once, as tables of B bands, N profiles each and P pixels a profile: single
+ones are so small that calling NumPy would take most of the time. Shorter bands are filled up with profiles that are not
+`valid`. Nothing passes from one band to another.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from itertools import combinations
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import product
 
 import numpy as np
 
 from lidarpose.detect.stripe_search import CoarseLine, PanelView
-from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.robust import MAD_TO_SIGMA, tukey_weights
 from lidarpose.model.image import GrayImage
 from lidarpose.model.observation import StripePoints
@@ -30,12 +33,18 @@ _SHORT = 300
 _MIN_POINTS = 8
 # Half-height of the band in which the coarse line is made fine, pixels.
 _FIRST_HALF = 12
-# A profile whose own centre is worse than this tells nothing.
+# A profile, or a point, whose centre is worse than this tells nothing.
 _WORST_SIGMA_PX = 0.8
 # Profiles without light keep to the curve by this pull, nothing against a real profile's hundredths.
 _PULL_PX = 1.5
+# Profiles of a band, about, that the width, the squares' colours and a first curve are found from.
+_FEW = 250
 # Pixels that the noise is learnt from, and the bins they are sorted into.
-_NOISE_SAMPLES, _NOISE_BINS = 2000, 8
+_NOISE_SAMPLES, _NOISE_BINS = 1200, 8
+# What the squares' edges and the blur are known to at best, in what they move a point by.
+_MODEL_SIGMA_PX = 0.01
+# A step that changes the width by this share and the typical centre by so many of its sigmas is the last one.
+_SETTLED_WIDTH, _SETTLED_SIGMAS, _MOST_STEPS = 0.04, 1.5, 6
 # Order of the unknowns: the first three are each profile's own, the width is common.
 _BACKGROUND, _HEIGHT, _CENTRE, _WIDTH = range(4)
 
@@ -61,39 +70,66 @@ class StripeFit:
     inflation: float
 
 
+_NO_RANGE = "no stripe on the panel: the bright line leaves the squares"
+_NO_RIDGE = "no stripe on the panel: the bright line is not a narrow ridge"
+_TOO_FEW = "no stripe on the panel: too few profiles show it"
+_TOO_ROUGH = "no usable stripe on the panel: what there is of it is too faint and rough to tell where it runs"
+_NOT_NARROW = "the bright line on the panel is not the narrow straight line that a laser makes"
+
+
 @dataclass(frozen=True, eq=False)
-class _Curve:
-    """v as a polynomial of u, in (u - middle) / half."""
+class _Curves:
+    """v as a polynomial of u, one a band, in (u - middle) / half: coefficients (B, K), middle and half (B, 1)."""
 
     coefficients: FloatArray
-    middle: float
-    half: float
+    middle: FloatArray
+    half: FloatArray
 
     def at(self, u: FloatArray) -> FloatArray:
         return _horner(self.coefficients, (u - self.middle) / self.half)
 
     def slope(self, u: FloatArray) -> FloatArray:
-        derivative = self.coefficients[1:] * np.arange(1, len(self.coefficients)) / self.half
+        derivative = self.coefficients[:, 1:] * np.arange(1, self.coefficients.shape[1]) / self.half
         return _horner(derivative, (u - self.middle) / self.half)
+
+    def take(self, which: BoolArray) -> _Curves:
+        return _Curves(self.coefficients[which], self.middle[which], self.half[which])
 
 
 def _horner(coefficients: FloatArray, x: FloatArray) -> FloatArray:
-    value = np.full_like(x, coefficients[-1])
-    for c in coefficients[-2::-1]:
-        value = value * x + c
-    return value
+    value = np.broadcast_to(coefficients[:, -1:], x.shape)
+    for k in range(coefficients.shape[1] - 2, -1, -1):
+        value = value * x + coefficients[:, k : k + 1]
+    return np.asarray(value)
 
 
 @dataclass(frozen=True, eq=False)
-class _Band:
-    """Profiles along the stripe, as a table of N profiles of P pixels.
+class _Ranges:
+    """Profiles of each band: whole coordinates u (B, N) along the stripe, and which of them are any (B, N)."""
 
-    u : (N,); v : (N, P) pixel coordinates; values, bright : grey levels; good : pixels that count;
-    ambient : light that was taken out of the values; cosine, sine : (N,) of the stripe's inclination;
+    u: FloatArray
+    valid: BoolArray
+
+    def take(self, which: BoolArray) -> _Ranges:
+        return _Ranges(self.u[which], self.valid[which])
+
+    def thinned(self) -> _Ranges:
+        """About `_FEW` profiles of the longest band, and as large a share of the others."""
+        step = max(self.u.shape[1] // _FEW, 1)
+        return _Ranges(self.u[:, ::step], self.valid[:, ::step])
+
+
+@dataclass(frozen=True, eq=False)
+class _Bands:
+    """Profiles along the stripes, as tables (B, N, P).
+
+    u, valid : (B, N); v : (B, N, P) pixel coordinates; values, bright : grey levels; good : pixels that count;
+    ambient : light that was taken out of the values; cosine, sine : (B, N) of the stripe's inclination;
     light : share of light surface that each pixel sees.
     """
 
     u: FloatArray
+    valid: BoolArray
     v: FloatArray
     values: FloatArray
     bright: FloatArray
@@ -105,168 +141,267 @@ class _Band:
 
     @property
     def half(self) -> int:
-        return int(self.v.shape[1] // 2)
+        return int(self.v.shape[2] // 2)
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """height, centre, background : (N,); information : (N,) on the centre, 1 / px^2 along v."""
+    """height, centre, background : (B, N); width, dark_ratio : (B,); noise : (B, 3); information : (B, N) on the
+    centre, 1 / px^2 along v."""
 
     height: FloatArray
     centre: FloatArray
     background: FloatArray
-    width: float
-    dark_ratio: float
-    noise: tuple[float, float, float]
+    width: FloatArray
+    dark_ratio: FloatArray
+    noise: FloatArray
     information: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class _Smooth:
-    """A smooth curve through the centres, the weight (N,) that each profile is left with, and its residual (N,)."""
+    """Smooth curves through the centres, the weight (B, N) that each profile is left with, and its residual (B, N).
 
-    curve: _Curve
+    `problems` are why a band shows no stripe, empty where it does.
+    """
+
+    curves: _Curves
     weight: FloatArray
     residual: FloatArray
+    problems: list[str]
 
 
-def fit_stripe(view: PanelView, image: GrayImage, line: CoarseLine, limit: float) -> StripeFit | str:
-    """Fit the stripe near `line`; `limit` is the grey level at which the sensor saturates. A string says why not."""
-    straight = _Curve(np.array([line.intercept, line.slope]), 0.0, 1.0)
-    u = _usable_range(view, line, straight)
-    if len(u) < _MIN_POINTS:
-        return "no stripe on the panel: the bright line leaves the squares"
-    first = _first_curve(_cut(view, image, line.steep, u, straight, _FIRST_HALF, limit), line, straight)
-    if isinstance(first, str):
-        return first
-    curve, width = first
-    band = _start_band(view, image, line.steep, u, curve, width, limit)
-    state = _start(band, curve, view, width)
-    band, state, smooth = _refine(band, state, view, line.steep, curve, steps=2)
-    if isinstance(smooth, str):
-        return smooth
-    if _half_height(smooth.curve, u, state.width) > band.half:
-        band = _start_band(view, image, line.steep, u, smooth.curve, state.width, limit)
-        state = replace(_start(band, smooth.curve, view, state.width), dark_ratio=state.dark_ratio)
-    band, state, smooth = _refine(band, state, view, line.steep, smooth.curve, steps=2)
-    return smooth if isinstance(smooth, str) else _points(band, smooth, line.steep, state)
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """Where the pixels come from: a panel, images of it whose stripes run the same way, and the sensor's limit."""
+
+    view: PanelView
+    images: Sequence[GrayImage]
+    steep: bool
+    limit: float
+
+    def take(self, which: BoolArray) -> _Source:
+        return replace(self, images=[image for image, taken in zip(self.images, which, strict=True) if taken])
 
 
-def _refine(
-    band: _Band, state: _State, view: PanelView, steep: bool, curve: _Curve, steps: int
-) -> tuple[_Band, _State, _Smooth | str]:
-    """Steps with the albedo as it is seen about the curve, and a smooth curve through what comes out."""
-    band = _look_at_albedo(band, view, steep, curve, state.width)
-    for step in range(steps):
-        state = _step(band, state, curve, learn=step == 0)
-    state = replace(state, dark_ratio=_dark_ratio(band, state))
-    return band, state, _smooth(band, state)
+def fit_stripes(
+    view: PanelView, images: Sequence[GrayImage], lines: Sequence[CoarseLine], limit: float
+) -> list[StripeFit | str]:
+    """Fit the stripe near each image's line; `limit` is the grey level at which the sensor saturates.
+
+    A string says why there is none.
+    """
+    found: list[StripeFit | str] = [_NO_RANGE] * len(images)
+    for steep in (False, True):
+        which = [k for k, line in enumerate(lines) if line.steep == steep]
+        source = _Source(view, [images[k] for k in which], steep, limit)
+        for k, fit in zip(which, _fit_alike(source, [lines[k] for k in which]), strict=True):
+            found[k] = fit
+    return found
 
 
-def _usable_range(view: PanelView, line: CoarseLine, curve: _Curve) -> FloatArray:
-    """Whole u (N,) near the coarse line's range whose centre lies in a usable square."""
-    axis = 1 if line.steep else 0
+def _fit_alike(source: _Source, lines: Sequence[CoarseLine]) -> list[StripeFit | str]:
+    """The same for stripes that all run along x, or all along y."""
+    found: list[StripeFit | str] = [_NO_RANGE] * len(lines)
+    if not lines:
+        return found
+    share = np.array([line.ambient_share for line in lines])
+    straight = _Curves(
+        np.array([[line.intercept, line.slope] for line in lines]), np.zeros((len(lines), 1)), np.ones((len(lines), 1))
+    )
+    ranges = _usable_ranges(source.view, lines, straight)
+    long_enough = ranges.valid.sum(axis=1) >= _MIN_POINTS
+    alive = np.flatnonzero(long_enough)
+    if len(alive) == 0:
+        return found
+    source, ranges, straight = source.take(long_enough), ranges.take(long_enough), straight.take(long_enough)
+    few = ranges.thinned() if ranges.valid.sum(axis=1).min() > _FEW else ranges
+    half = np.full(len(alive), _FIRST_HALF)
+    curves, width, is_ridge = _first_curves(_cut(source, few, straight, half), share[long_enough], straight)
+    for k in alive[~is_ridge]:
+        found[k] = _NO_RIDGE
+    alive = alive[is_ridge]
+    if len(alive) == 0:
+        return found
+    near = (source.take(is_ridge), ranges.take(is_ridge), few.take(is_ridge), curves.take(is_ridge))
+    fits = _fit_near(*near, width[is_ridge])
+    for k, fit in zip(alive, fits, strict=True):
+        found[k] = fit
+    return found
+
+
+def _fit_near(
+    source: _Source, ranges: _Ranges, few: _Ranges, curves: _Curves, width: FloatArray
+) -> list[StripeFit | str]:
+    """Fit bands about curves that are right to a pixel: some of the profiles first, then all."""
+    albedo = source.view.albedo
+    ratio = float(np.clip(np.median(albedo.dark / np.maximum(albedo.light, 1.0)), 0.02, 0.95))
+    bands = _look_at_albedo(_bands_about(source, few, curves, width), source, curves, width)
+    state = _start(bands, curves, width, np.full(len(width), ratio), None)
+    state = _settle(bands, state, curves, learn_at=0, least=1)
+    curves, ratios = _smooth(bands, state).curves, _dark_ratios(bands, state)
+    bands = _look_at_albedo(_bands_about(source, ranges, curves, state.width), source, curves, state.width)
+    state = _start(bands, curves, state.width, ratios, state.noise)
+    state = _settle(bands, state, curves, learn_at=1, least=2)
+    smooth = _smooth(bands, state)
+    state = replace(state, dark_ratio=_dark_ratios(bands, state))
+    return [problem or _points(bands, smooth, source.steep, state, b) for b, problem in enumerate(smooth.problems)]
+
+
+def _settle(bands: _Bands, state: _State, curves: _Curves, *, learn_at: int, least: int) -> _State:
+    """Steps until each band's width and centres stay; the noise is learnt from what is left before step `learn_at`.
+
+    Two steps do for most; it is saturated stripes, of which only the skirts are seen, that take more. A band that has
+    settled is left as it is, so that the others do not matter to it.
+    """
+    moving = np.ones(len(state.width), dtype=bool)
+    for step in range(_MOST_STEPS):
+        after = _step(bands, state, curves, learn=step == learn_at)
+        settled = _has_settled(bands, state, after)
+        state = after if moving.all() else _chosen(moving, after, state)
+        if step + 1 >= least:
+            moving = moving & ~settled
+        if not moving.any():
+            break
+    return state
+
+
+def _has_settled(bands: _Bands, before: _State, after: _State) -> BoolArray:
+    """Whether the last step (B,) was so small that the next one would not matter."""
+    moved = np.abs(after.centre - before.centre) * np.sqrt(after.information)
+    small = _quantiles(moved, bands.valid, 0.5) < _SETTLED_SIGMAS
+    return np.asarray(small & (np.abs(np.log(after.width / before.width)) < _SETTLED_WIDTH))
+
+
+def _chosen(which: BoolArray, a: _State, b: _State) -> _State:
+    """`a` for the bands in `which`, `b` for the others."""
+    found = {}
+    for entry in fields(_State):
+        x, y = getattr(a, entry.name), getattr(b, entry.name)
+        found[entry.name] = np.where(which if x.ndim == 1 else which[:, None], x, y)
+    return _State(**found)
+
+
+def _usable_ranges(view: PanelView, lines: Sequence[CoarseLine], curves: _Curves) -> _Ranges:
+    """Whole u near the coarse lines' ranges whose centre lies in a usable square."""
+    steep = lines[0].steep
+    axis, across = (1, 0) if steep else (0, 1)
     slack = 4 * view.factor
-    first = max(int(np.floor(line.start)) - slack, view.low[axis])
-    last = min(int(np.ceil(line.end)) + slack, view.high[axis] - 1)
-    u = np.arange(first, last + 1, dtype=np.float64)
-    v = curve.at(u)
-    across = 1 - axis
-    inside = (v > view.low[across] + 3) & (v < view.high[across] - 4)
-    u, v = u[inside], v[inside]
-    if len(u) == 0:
-        return u
-    grid, _ = view.grid_and_slopes(_pixels(u, v, line.steep))
-    return u[view.albedo.is_usable(grid)]
+    first = np.array([max(int(np.floor(line.start)) - slack, view.low[axis]) for line in lines])
+    last = np.array([min(int(np.ceil(line.end)) + slack, view.high[axis] - 1) for line in lines])
+    u = first[:, None] + np.arange(max(int((last - first).max()) + 1, 1), dtype=np.float64)
+    v = curves.at(u)
+    usable = (u <= last[:, None]) & (v > view.low[across] + 3) & (v < view.high[across] - 4)
+    at = np.nonzero(usable)
+    grid, _ = view.grid_and_slopes(_pixels(u[at], v[at], steep))
+    usable[at] = view.albedo.is_usable(grid)
+    # Usable ones to the front of each row; what fills it up repeats the first.
+    count = usable.sum(axis=1)
+    order = np.argsort(~usable, axis=1, kind="stable")[:, : max(int(count.max()), 1)]
+    valid = np.arange(order.shape[1]) < count[:, None]
+    return _Ranges(np.take_along_axis(u, np.where(valid, order, order[:, :1]), axis=1), valid)
 
 
 def _pixels(u: FloatArray, v: FloatArray, steep: bool) -> FloatArray:
     return np.stack([v, u] if steep else [u, v], axis=-1)
 
 
-def _cut(
-    view: PanelView, image: GrayImage, steep: bool, u: FloatArray, curve: _Curve, half: int, limit: float
-) -> _Band:
-    """Profiles of 2 half + 1 pixels about the curve."""
-    v = np.rint(curve.at(u)).astype(np.intp)[:, None] + np.arange(-half, half + 1)
+def _cut(source: _Source, ranges: _Ranges, curves: _Curves, half: FloatArray) -> _Bands:
+    """Profiles of 2 half + 1 pixels about the curves; `half` (B,) may differ from band to band."""
+    view, steep = source.view, source.steep
+    reach = int(half.max())
+    offsets = np.arange(-reach, reach + 1)
+    v = np.rint(curves.at(ranges.u)).astype(np.intp)[..., None] + offsets
     across = 0 if steep else 1
-    low, high = view.low[across], view.high[across]
-    safe = np.clip(v, low, high - 1)
-    along = u.astype(np.intp)[:, None]
+    safe = np.clip(v, view.low[across], view.high[across] - 1)
+    along = ranges.u.astype(np.intp)[..., None]
     rows, columns = (along, safe) if steep else (safe, along)
-    values = image.take(rows * image.shape[1] + columns).astype(np.float32)
+    index = rows * source.images[0].shape[1] + columns
+    values = np.stack([image.take(i) for image, i in zip(source.images, index, strict=True)])
     bright = view.bright.take((rows - view.low[1]) * view.bright.shape[1] + (columns - view.low[0]))
-    good = ((v == safe) & (values < 0.98 * limit)).astype(np.float32)
-    slope = curve.slope(u)
+    within = ranges.valid[..., None] & (np.abs(offsets) <= half[:, None, None])
+    good = ((v == safe) & (values < 0.98 * source.limit) & within).astype(np.float32)
+    slope = curves.slope(ranges.u)
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
+    values = values.astype(np.float32)
     nothing = np.zeros_like(values)
-    return _Band(u, v.astype(np.float32), values, bright, good, nothing, cosine, slope * cosine, nothing)
+    return _Bands(
+        ranges.u, ranges.valid, v.astype(np.float32), values, bright, good, nothing, cosine, slope * cosine, nothing
+    )
 
 
-def _half_height(curve: _Curve, u: FloatArray, width: float) -> int:
-    """Half-height of a band that holds the profile and enough of its surroundings."""
-    steepest = float(np.sqrt(1.0 + np.max(np.abs(curve.slope(u))) ** 2))
-    return int(np.clip(np.ceil(3.3 * width * steepest + 1.5), 4, 24))
+def _half_heights(curves: _Curves, ranges: _Ranges, width: FloatArray) -> FloatArray:
+    """Half-heights (B,) of bands that hold the profile and enough of its surroundings."""
+    steepest = np.sqrt(1.0 + np.max(np.abs(curves.slope(ranges.u)), axis=1) ** 2)
+    return np.asarray(np.clip(np.ceil(3.3 * width * steepest + 1.5), 4, 24))
 
 
-def _start_band(
-    view: PanelView, image: GrayImage, steep: bool, u: FloatArray, curve: _Curve, width: float, limit: float
-) -> _Band:
-    """The band about a good curve, with the ambient light taken out."""
-    band = _cut(view, image, steep, u, curve, _half_height(curve, u, width), limit)
-    flank = band.good * (np.abs(_distance(band, curve.at(u))) > 2.7 * width)
-    ambient = _ambient(band, flank)
-    return replace(band, values=band.values - ambient, ambient=ambient)
+def _bands_about(source: _Source, ranges: _Ranges, curves: _Curves, width: FloatArray) -> _Bands:
+    """The bands about good curves, with the ambient light taken out and the first backgrounds."""
+    bands = _cut(source, ranges, curves, _half_heights(curves, ranges, width))
+    flank = bands.good * (np.abs(_distance(bands, curves.at(bands.u))) > _table(2.7 * width))
+    ambient = _ambient(bands, flank, curves)
+    return replace(bands, values=bands.values - ambient, ambient=ambient)
 
 
-def _distance(band: _Band, centre: FloatArray) -> FloatArray:
-    """Distance (N, P) of the pixels from the stripe's centre line."""
-    return np.asarray((band.v - _column(centre)) * _column(band.cosine))
+def _distance(bands: _Bands, centre: FloatArray) -> FloatArray:
+    """Distance (B, N, P) of the pixels from the stripe's centre line."""
+    return np.asarray((bands.v - _column(centre)) * _column(bands.cosine))
 
 
 def _column(values: FloatArray) -> FloatArray:
-    return np.asarray(values, dtype=np.float32)[:, None]
+    """Values (B, N) of profiles, to be used with (B, N, P)."""
+    return np.asarray(values, dtype=np.float32)[..., None]
 
 
-def _first_curve(band: _Band, line: CoarseLine, straight: _Curve) -> tuple[_Curve, float] | str:
-    """A curve within about a pixel, from the brightest pixel of each profile, and the stripe's rough width."""
-    rest = band.values - np.float32(line.ambient_share) * band.bright
-    rest -= rest.mean(axis=1, keepdims=True)
+def _table(values: FloatArray) -> FloatArray:
+    """Values (B,) of bands, to be used with (B, N, P)."""
+    return np.asarray(values, dtype=np.float32)[:, None, None]
+
+
+def _first_curves(bands: _Bands, share: FloatArray, straight: _Curves) -> tuple[_Curves, FloatArray, BoolArray]:
+    """Curves within about a pixel, from the brightest pixel of each profile, the stripes' rough widths (B,), and
+    whether there is a ridge at all (B,)."""
+    rest = bands.values - _table(share) * bands.bright
+    rest -= rest.mean(axis=2, keepdims=True)
     smooth = rest.copy()
-    smooth[:, 1:-1] = 0.25 * rest[:, :-2] + 0.5 * rest[:, 1:-1] + 0.25 * rest[:, 2:]
-    peak = np.argmax(smooth, axis=1)
-    rows = np.arange(len(peak))
-    height = smooth[rows, peak]
-    strong = height > 0.4 * _quantile(height, 0.75)
-    offset = band.v[rows, peak] - straight.at(band.u)
-    weight = np.where(strong, 1.0, 0.0)
-    curve = straight
+    smooth[..., 1:-1] = 0.25 * rest[..., :-2] + 0.5 * rest[..., 1:-1] + 0.25 * rest[..., 2:]
+    peak = np.argmax(smooth, axis=2)[..., None]
+    height = np.take_along_axis(smooth, peak, axis=2)[..., 0]
+    v = np.take_along_axis(bands.v, peak, axis=2)[..., 0].astype(np.float64)
+    strong = bands.valid & (height > 0.4 * _quantiles(height, bands.valid, 0.75)[:, None])
+    near, is_ridge, curves = strong, np.ones(len(v), dtype=bool), straight
     for reach in (8.0, 4.0, 2.5):
-        near = weight * (np.abs(band.v[rows, peak] - curve.at(band.u)) <= reach)
-        if np.count_nonzero(near) < _MIN_POINTS:
-            return "no stripe on the panel: the bright line is not a narrow ridge"
-        curve = _fit_curve(band.u, straight.at(band.u) + offset, near, degree=2)
-    chosen = rows[near > 0]
-    window = np.clip(peak[chosen][:, None] + np.arange(-9, 10), 0, rest.shape[1] - 1)
-    area = np.maximum(rest[chosen[:, None], window], 0.0).sum(axis=1) / height[chosen]
-    cosine = 1.0 / np.sqrt(1.0 + curve.slope(band.u[chosen]) ** 2)
+        near = strong & (np.abs(v - curves.at(bands.u)) <= reach)
+        is_ridge &= np.count_nonzero(near, axis=1) >= _MIN_POINTS
+        curves = _fit_curves(bands, v, near.astype(np.float64), 2)
+    window = np.clip(peak + np.arange(-9, 10), 0, rest.shape[2] - 1)
+    area = np.maximum(np.take_along_axis(rest, window, axis=2), 0.0).sum(axis=2) / np.maximum(height, 1e-3)
+    cosine = 1.0 / np.sqrt(1.0 + curves.slope(bands.u) ** 2)
     # Speckle makes the highest pixel too high, by this much typically, and the width too small.
-    width = 1.15 * _quantile(area * cosine, 0.5) / np.sqrt(2.0 * np.pi)
-    return curve, float(np.clip(width, 0.6, 6.0))
+    width = 1.15 * _quantiles(area * cosine, near, 0.5) / np.sqrt(2.0 * np.pi)
+    return curves, np.clip(width, 0.6, 6.0), is_ridge
 
 
-def _fit_curve(u: FloatArray, v: FloatArray, weight: FloatArray, degree: int) -> _Curve:
-    """Weighted least squares; well conditioned in a coordinate from -1 to 1."""
-    middle, half = 0.5 * float(u[0] + u[-1]), max(0.5 * float(u[-1] - u[0]), 1.0)
+def _fit_curves(
+    bands: _Bands, v: FloatArray, weight: FloatArray, degree: int, cubic: BoolArray | None = None
+) -> _Curves:
+    """Weighted least squares; well conditioned in a coordinate from -1 to 1. Where not `cubic`, without the cube."""
+    u = bands.u
+    last = np.take_along_axis(u, np.maximum(bands.valid.sum(axis=1) - 1, 0)[:, None], axis=1)
+    middle, half = 0.5 * (u[:, :1] + last), np.maximum(0.5 * (last - u[:, :1]), 1.0)
     s = (u - middle) / half
-    powers = [np.ones_like(s)]
-    for _ in range(degree):
+    powers = [np.ones_like(s), s]
+    for _ in range(degree - 1):
         powers.append(powers[-1] * s)
-    design = np.stack(powers)
-    weighted = design * weight
-    normal = weighted @ design.T
-    coefficients = np.linalg.solve(normal + np.eye(degree + 1) * (1e-12 * np.trace(normal)), weighted @ v)
-    return _Curve(coefficients, middle, half)
+    design = np.stack(powers, axis=1)
+    weighted = design * weight[:, None]
+    normal = weighted @ design.swapaxes(1, 2)
+    trace = np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-30)
+    normal += np.eye(degree + 1) * (1e-12 * trace)[:, None, None]
+    if cubic is not None:
+        normal[:, 3, 3] += np.where(cubic, 0.0, 1e9 * trace)
+    return _Curves(np.linalg.solve(normal, weighted @ v[..., None])[..., 0], middle, half)
 
 
 def _quantile(values: FloatArray, share: float) -> float:
@@ -275,123 +410,139 @@ def _quantile(values: FloatArray, share: float) -> float:
     return float(np.partition(values, k)[k])
 
 
-def _spread(values: FloatArray) -> float:
-    """Robust standard deviation about zero."""
-    return MAD_TO_SIGMA * _quantile(np.abs(values), 0.5) if len(values) else float("nan")
+def _quantiles(values: FloatArray, which: BoolArray, share: float) -> FloatArray:
+    """The same (B,) for each row of `values` (B, N), of those in `which` (B, N); infinite where there are none."""
+    count = np.count_nonzero(which, axis=1)
+    k = (share * np.maximum(count - 1, 0)).astype(np.intp)
+    ordered = np.sort(np.where(which, values, np.inf), axis=1)
+    return np.asarray(np.take_along_axis(ordered, k[:, None], axis=1)[:, 0], dtype=np.float64)
 
 
-def _start(band: _Band, curve: _Curve, view: PanelView, width: float) -> _State:
-    """Guess heights and backgrounds."""
-    centre = curve.at(band.u)
-    distance = np.abs(_distance(band, centre))
-    flank, core = band.good * (distance > 2.7 * width), band.good * (distance < width)
-    background = (band.values * flank).sum(axis=1) / np.maximum(flank.sum(axis=1), 1.0)
-    rest = band.values - background[:, None]
-    height = (rest * core).sum(axis=1) / np.maximum(core.sum(axis=1), 1.0) / 0.85
-    reading = 1.25 * float((np.abs(rest) * flank).sum() / max(float(flank.sum()), 1.0))
-    ratio = float(np.clip(np.median(view.albedo.dark / np.maximum(view.albedo.light, 1.0)), 0.02, 0.95))
-    noise = (max(reading, 0.3) ** 2, 0.0, 0.0)
-    return _State(np.maximum(height, 1.0), centre, background, width, ratio, noise, np.ones(len(centre)))
+def _spreads(values: FloatArray, which: BoolArray) -> FloatArray:
+    """Robust standard deviation about zero of each row; infinite where `which` has none."""
+    return MAD_TO_SIGMA * _quantiles(np.abs(values), which, 0.5)
 
 
-def _ambient(band: _Band, flank: FloatArray) -> FloatArray:
+def _start(bands: _Bands, curves: _Curves, width: FloatArray, ratio: FloatArray, noise: FloatArray | None) -> _State:
+    """Heights and backgrounds by least squares with all else as given; a guess of the noise from the pixels beside."""
+    centre = curves.at(bands.u)
+    distance = _distance(bands, centre) * _table(1.0 / width)
+    bell = np.exp(np.float32(-0.5) * distance * distance) * (_table(ratio) + _table(1.0 - ratio) * bands.light)
+    weighted = bands.good * bell
+    n, b, v = (np.einsum("bnp,bnp->bn", bands.good, x) for x in (np.ones_like(bell), bell, bands.values))
+    bb, bv = (np.einsum("bnp,bnp->bn", weighted, x) for x in (bell, bands.values))
+    det = np.maximum(n * bb - b * b, 1e-3)
+    height = np.maximum((n * bv - b * v) / det, 1.0)
+    background = (v - height * b) / np.maximum(n, 1.0)
+    if noise is None:
+        flank = bands.good * (np.abs(distance) > 2.7)
+        rest = np.abs(bands.values - background[..., None]) * flank
+        reading = 1.25 * rest.sum(axis=(1, 2)) / np.maximum(flank.sum(axis=(1, 2)), 1.0)
+        noise = np.stack([np.maximum(reading, 0.3) ** 2, np.zeros(len(ratio)), np.zeros(len(ratio))], axis=1)
+    return _State(height, centre, background, width, ratio, noise, np.ones_like(centre))
+
+
+def _ambient(bands: _Bands, flank: FloatArray, curves: _Curves) -> FloatArray:
     """The bright image times a share that changes slowly along the stripe, from the pixels beside it (`flank`)."""
-    count = np.maximum(flank.sum(axis=1, keepdims=True), 1.0)
-    values, bright = (flank * (x - (x * flank).sum(axis=1, keepdims=True) / count) for x in (band.values, band.bright))
-    s = (band.u - band.u.mean()) / max(float(np.ptp(band.u)) / 2.0, 1.0)
-    powers = np.stack([np.ones_like(s), s, s**2], axis=1)
-    own, cross = np.einsum("np,np->n", bright, bright), np.einsum("np,np->n", bright, values)
-    normal = (powers * own[:, None]).T @ powers
+    count = np.maximum(flank.sum(axis=2, keepdims=True), 1.0)
+    values, bright = (
+        flank * (x - (x * flank).sum(axis=2, keepdims=True) / count) for x in (bands.values, bands.bright)
+    )
+    s = (bands.u - curves.middle) / curves.half
+    powers = np.stack([np.ones_like(s), s, s**2], axis=2)
+    own, cross = np.einsum("bnp,bnp->bn", bright, bright), np.einsum("bnp,bnp->bn", bright, values)
+    normal = (powers * own[..., None]).swapaxes(1, 2) @ powers
     # Flat profiles tell nothing: a weak pull towards no ambient light.
-    share = np.linalg.solve(normal + np.eye(3) * (1e-6 * np.trace(normal) + 1.0), powers.T @ cross)
-    return np.asarray(_column(powers @ share) * band.bright)
+    normal += np.eye(3) * (1e-6 * np.trace(normal, axis1=1, axis2=2) + 1.0)[:, None, None]
+    share = np.linalg.solve(normal, powers.swapaxes(1, 2) @ cross[..., None].astype(np.float64))
+    return np.asarray(_column((powers @ share)[..., 0]) * bands.bright)
 
 
-def _look_at_albedo(band: _Band, view: PanelView, steep: bool, curve: _Curve, width: float) -> _Band:
+def _look_at_albedo(bands: _Bands, source: _Source, curves: _Curves, width: FloatArray) -> _Bands:
     """Share of light surface that each pixel sees through stripe and lens (see `laser_stripe`)."""
+    view, steep = source.view, source.steep
     albedo = view.albedo
-    centre = curve.at(band.u)
-    slope = curve.slope(band.u)
+    centre, slope = curves.at(bands.u), curves.slope(bands.u)
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
-    band = replace(band, cosine=cosine, sine=slope * cosine)
-    grid, slopes = view.grid_and_slopes(_pixels(band.u, centre, steep))
-    by_u, by_v = (slopes[:, 1::2], slopes[:, ::2]) if steep else (slopes[:, ::2], slopes[:, 1::2])
-    across = by_v * _column(cosine) - by_u * _column(band.sine)
-    along = by_u * _column(cosine) + by_v * _column(band.sine)
-    blur2 = min(albedo.blur_px, width) ** 2
-    thickness = 1.0 - blur2 / width**2
-    edges = np.sqrt(blur2 * (thickness * across**2 + along**2))
+    sine = slope * cosine
+    grid, slopes = view.grid_and_slopes(_pixels(centre, bands.u, True) if steep else _pixels(bands.u, centre, False))
+    by_u, by_v = (slopes[..., 1::2], slopes[..., ::2]) if steep else (slopes[..., ::2], slopes[..., 1::2])
+    across = by_v * cosine[..., None] - by_u * sine[..., None]
+    along = by_u * cosine[..., None] + by_v * sine[..., None]
+    blur2 = np.minimum(albedo.blur_px, width) ** 2
+    thickness = (1.0 - blur2 / width**2)[:, None]
+    edges = np.sqrt(blur2[:, None, None] * (thickness[..., None] * across**2 + along**2))
     # A pixel at (0, dv) from the centre is seen at dv along the stripe's tangent plus `thickness` of it across.
-    dv = band.v - _column(centre)
-    per_v = by_v * _column(cosine**2 * thickness + band.sine**2)
-    per_v = np.asarray(per_v + by_u * _column((1.0 - thickness) * cosine * band.sine), dtype=np.float32)
+    dv = bands.v - _column(centre)
+    per_v = by_v * (cosine**2 * thickness + sine**2)[..., None]
+    per_v = per_v + by_u * ((1.0 - thickness) * cosine * sine)[..., None]
     inside = _inside_squares(view, grid, across, width)
-    x, y = (dv * per_v[:, k, None] + _column(grid[:, k]) for k in (0, 1))
-    light = albedo.light_share(x, y, _column(edges[:, 0]), _column(edges[:, 1]))
-    return replace(band, light=light, good=band.good * inside[:, None])
+    x, y = (dv * _column(per_v[..., k]) + _column(grid[..., k]) for k in (0, 1))
+    light = albedo.light_share(x, y, _column(edges[..., 0]), _column(edges[..., 1]))
+    return replace(bands, cosine=cosine, sine=sine, light=light, good=bands.good * inside[..., None])
 
 
-def _inside_squares(view: PanelView, grid: FloatArray, across: FloatArray, width: float) -> FloatArray:
-    """1 for profiles (N,) whose light falls on usable squares alone: what lies around the board is not known.
+def _inside_squares(view: PanelView, grid: FloatArray, across: FloatArray, width: FloatArray) -> FloatArray:
+    """1 for profiles (B, N) whose light falls on usable squares alone: what lies around the board is not known.
 
-    `across` (N, 2) is the change of the grid coordinates by a pixel across the stripe.
+    `across` (B, N, 2) is the change of the grid coordinates by a pixel across the stripe.
     """
     usable = view.albedo.is_usable
-    reach = 2.5 * width * across
+    reach = 2.5 * width[:, None, None] * across
     return (usable(grid) & usable(grid - reach) & usable(grid + reach)).astype(np.float32)
 
 
-def _step(band: _Band, state: _State, curve: _Curve, *, learn: bool) -> _State:
+def _step(bands: _Bands, state: _State, curves: _Curves, *, learn: bool) -> _State:
     """One Gauss-Newton step; with `learn`, the noise is learnt again first."""
-    distance = _distance(band, state.centre) * np.float32(1.0 / state.width)
+    distance = _distance(bands, state.centre) * _table(1.0 / state.width)
     squared = distance * distance
     bell = np.exp(np.float32(-0.5) * squared)
-    ratio, height = np.float32(state.dark_ratio), _column(state.height)
-    by_height = bell * (ratio + (1 - ratio) * band.light)
+    ratio, height = _table(state.dark_ratio), _column(state.height)
+    by_height = bell * (ratio + (1 - ratio) * bands.light)
     signal = height * by_height
-    rest = band.values - _column(state.background)
-    residual = rest - signal
-    level = np.maximum(band.values + band.ambient, np.float32(0.0))
-    noise = _learn_noise(residual, level, signal, band.good, state.noise) if learn else state.noise
-    variance = np.float32(noise[0]) + np.float32(noise[1]) * level + np.float32(noise[2]) * signal * signal
-    weight = band.good / variance
+    residual = bands.values - _column(state.background) - signal
+    level = np.maximum(bands.values + bands.ambient, np.float32(0.0))
+    noise = _learn_noise(residual, level, signal, bands.good, state.noise) if learn else state.noise
+    variance = _table(noise[:, 0]) + _table(noise[:, 1]) * level + _table(noise[:, 2]) * signal * signal
+    weight = bands.good / variance
     J = [
         np.ones_like(signal),
         by_height,
-        signal * distance * _column(band.cosine / state.width),
+        signal * distance * _column(bands.cosine / state.width[:, None]),
         signal * squared,
     ]
     M = _normal_equations(J, residual, weight)
     M[_BACKGROUND][0] += 1e-9
     M[_HEIGHT][0] += 1e-9
     M[_CENTRE][0] += 1.0 / _PULL_PX**2
-    M[_CENTRE][-1] += (curve.at(band.u) - state.centre) / _PULL_PX**2
+    M[_CENTRE][-1] += (curves.at(bands.u) - state.centre) / _PULL_PX**2
     change, by_width, information = _solve(M)
     return _State(
         np.maximum(state.height + change[_HEIGHT], 1e-3),
         state.centre + np.clip(change[_CENTRE], -1.0, 1.0),
         state.background + change[_BACKGROUND],
-        float(np.clip(state.width * np.exp(by_width), 0.4, 10.0)),
+        np.clip(state.width * np.exp(by_width), 0.4, 10.0),
         state.dark_ratio,
         noise,
         information,
     )
 
 
-def _normal_equations(J: list[FloatArray], residual: FloatArray, weight: FloatArray) -> list[FloatArray]:
+def _normal_equations(J: Sequence[FloatArray], residual: FloatArray, weight: FloatArray) -> list[FloatArray]:
     """Upper triangle, row by row, of the sums over each profile of weight * J_i * J_j; last in each row, the residual.
 
-    Row i is an array (k - i + 1, N) of k unknowns' products, from the diagonal on.
+    Row i is an array (k - i + 1, B, N) of k unknowns' products, from the diagonal on.
     """
-    rows = []
+    rows: list[FloatArray] = []
     for i in range(len(J)):
         weighted = J[i] * weight
-        rows.append(np.stack([np.einsum("np,np->n", weighted, other) for other in (*J[i:], residual)]).astype(float))
+        products = [np.einsum("bnp,bnp->bn", weighted, other) for other in (*J[i:], residual)]
+        rows.append(np.stack(products).astype(np.float64))
     return rows
 
 
-def _solve(rows: list[FloatArray]) -> tuple[list[FloatArray], float, FloatArray]:
-    """Changes (N,) of the profiles' own unknowns, of the width's logarithm, and the centres' information (N,).
+def _solve(rows: list[FloatArray]) -> tuple[list[FloatArray], FloatArray, FloatArray]:
+    """Changes (B, N) of the profiles' own unknowns, (B,) of the width's logarithm, and the centres' information (B, N).
 
     Gauss's elimination of each profile's own unknowns, what is left summed over the profiles. `rows` are used up.
     """
@@ -400,112 +551,130 @@ def _solve(rows: list[FloatArray]) -> tuple[list[FloatArray], float, FloatArray]
         for i in range(k + 1, len(rows)):
             rows[i] -= share[i - k - 1] * rows[k][i - k :]
     normal, goal = rows[_WIDTH].sum(axis=-1)
-    by_width = float(np.clip(goal / (normal + 1e-6), -0.3, 0.3))
+    by_width = np.clip(goal / (normal + 1e-6), -0.3, 0.3)
     changes: list[FloatArray] = [np.zeros(0)] * _WIDTH
     for k in reversed(range(_WIDTH)):
-        value = rows[k][-1] - rows[k][_WIDTH - k] * by_width
+        value = rows[k][-1] - rows[k][_WIDTH - k] * by_width[:, None]
         for j in range(k + 1, _WIDTH):
             value = value - rows[k][j - k] * changes[j]
         changes[k] = value / rows[k][0]
     return changes, by_width, np.asarray(rows[_CENTRE][0])
 
 
-def _dark_ratio(band: _Band, state: _State) -> float:
-    """Light that dark squares send back against light ones, at the laser's colour: from the profiles wholly on either.
+def _dark_ratios(bands: _Bands, state: _State) -> FloatArray:
+    """Light (B,) that dark squares send back against light ones, at the laser's colour: from the profiles wholly on
+    either.
 
     Not fitted with the rest: its product with the heights makes a bad start worse.
     """
-    share = band.light[:, band.half]
-    light, dark = state.height[share > 0.98], state.height[share < 0.02]
-    if min(len(light), len(dark)) < 20:
-        return state.dark_ratio
-    seen = state.dark_ratio * _quantile(dark, 0.5) / _quantile(light, 0.5)
-    return float(np.clip(seen, 0.01, 1.0))
+    share = bands.light[..., bands.half]
+    on_light, on_dark = bands.valid & (share > 0.98), bands.valid & (share < 0.02)
+    enough = np.minimum(np.count_nonzero(on_light, axis=1), np.count_nonzero(on_dark, axis=1)) >= 20
+    light, dark = (_quantiles(state.height, which, 0.5) for which in (on_light, on_dark))
+    seen = state.dark_ratio * np.where(enough, dark, 1.0) / np.where(enough, light, 1.0)
+    return np.where(enough, np.clip(seen, 0.01, 1.0), state.dark_ratio)
 
 
 def _learn_noise(
-    residual: FloatArray, level: FloatArray, signal: FloatArray, good: FloatArray, before: tuple[float, float, float]
-) -> tuple[float, float, float]:
+    residual: FloatArray, level: FloatArray, signal: FloatArray, good: FloatArray, before: FloatArray
+) -> FloatArray:
     """Variance as r^2 + g * level + s^2 * signal^2 (all >= 0), from residuals sorted into bins by the signal."""
+    bins = [_noise_bins(*(x[b].ravel() for x in (residual, level, signal, good))) for b in range(len(good))]
+    learnt = np.array([b for b, found in enumerate(bins) if found is not None], dtype=np.intp)
+    noise = before.copy()
+    if len(learnt):
+        variance, by_level, by_signal = np.stack([found for found in bins if found is not None], axis=1)
+        design = np.stack([np.ones_like(variance), by_level, by_signal], axis=-1)
+        noise[learnt] = _not_negative(design / variance[..., None], np.ones_like(variance))
+        noise[learnt, 0] = np.maximum(noise[learnt, 0], 0.05)
+    return noise
+
+
+def _noise_bins(residual: FloatArray, level: FloatArray, signal: FloatArray, good: FloatArray) -> FloatArray | None:
+    """Variance, mean level and mean squared signal (3, bins) of one band's pixels; None if they are too few."""
     step = max(good.size // _NOISE_SAMPLES, 1)
-    some = np.flatnonzero(good.ravel()[::step]) * step
+    some = np.flatnonzero(good[::step]) * step
     if len(some) < 12 * _NOISE_BINS:
-        return before
+        return None
     some = some[: len(some) // _NOISE_BINS * _NOISE_BINS]
-    signal = signal.ravel()[some]
-    order = np.argsort(signal)
-    error, level, signal = (
-        x.reshape(_NOISE_BINS, -1)
-        for x in (np.abs(residual.ravel()[some])[order], level.ravel()[some[order]], signal[order])
-    )
+    some = some[np.argsort(signal[some])]
+    error, level, signal = (x[some].reshape(_NOISE_BINS, -1) for x in (np.abs(residual), level, signal))
     # Medians are deaf to what does not belong; a sixth of the freedom went into the fit.
     middle = error.shape[1] // 2
     variance = np.maximum(1.2 * (MAD_TO_SIGMA * np.partition(error, middle, axis=1)[:, middle]) ** 2, 0.05)
-    design = np.stack([np.ones(_NOISE_BINS), level.mean(axis=1), (signal**2).mean(axis=1)], axis=1)
-    solution = _not_negative(design / variance[:, None], np.ones(_NOISE_BINS))
-    return (max(float(solution[0]), 0.05), float(solution[1]), float(solution[2]))
+    return np.stack([variance, level.mean(axis=1), (signal**2).mean(axis=1)])
 
 
 def _not_negative(design: FloatArray, goal: FloatArray) -> FloatArray:
-    """Least squares with no unknown below zero, for a few unknowns: the best of all choices of those that are zero."""
-    count = design.shape[1]
-    best, least = np.zeros(count), float(goal @ goal)
-    for size in range(count, 0, -1):
-        for free in combinations(range(count), size):
-            found = np.linalg.lstsq(design[:, free], goal, rcond=None)[0]
-            rest = goal - design[:, free] @ found
-            if found.min() >= 0.0 and float(rest @ rest) < least:
-                best, least = np.zeros(count), float(rest @ rest)
-                best[list(free)] = found
-        if size == count and best.any():
-            break
-    return best
+    """Least squares (B, k) with no unknown below zero, k small, for design (B, M, k) and goal (B, M).
+
+    The best of all choices of the unknowns that are zero.
+    """
+    count = design.shape[-1]
+    free = np.array(list(product((0.0, 1.0), repeat=count)))[:, None]
+    scale = np.maximum(np.linalg.norm(design, axis=1), 1e-30)
+    A = design / scale[:, None]
+    normal, right = A.swapaxes(1, 2) @ A, (A.swapaxes(1, 2) @ goal[..., None])[..., 0]
+    # Unknowns that are held at zero get the equation x = 0; the tiny part keeps equal columns solvable.
+    both = free[..., None] * free[..., None, :]
+    systems = normal * both + np.eye(count) * (1.0 - free[..., None] + 1e-12)
+    found = np.linalg.solve(systems, (right * free)[..., None])[..., 0]
+    rest = ((np.einsum("bmk,cbk->cbm", A, found) - goal) ** 2).sum(axis=-1)
+    rest = np.where(found.min(axis=-1) >= 0.0, rest, np.inf)
+    best = np.argmin(rest, axis=0)
+    return np.asarray(found[best, np.arange(len(best))] / scale)
 
 
-def _smooth(band: _Band, state: _State) -> _Smooth | str:
-    """A smooth curve through the centres, robust against the profiles that show something else."""
+def _smooth(bands: _Bands, state: _State) -> _Smooth:
+    """Smooth curves through the centres, robust against the profiles that show something else."""
     sigma = 1.0 / np.sqrt(state.information)
-    weight = np.where(sigma * band.cosine < _WORST_SIGMA_PX, state.information, 0.0)
+    known = bands.valid & (sigma * bands.cosine < _WORST_SIGMA_PX)
+    weight = np.where(known, state.information, 0.0)
     robust = weight
-    degree = 3 if np.count_nonzero(weight) > 60 else 2
+    cubic = np.count_nonzero(known, axis=1) > 60
+    enough = np.ones(len(sigma), dtype=bool)
     for _ in range(3):
-        if np.count_nonzero(robust) < _MIN_POINTS:
-            return "no stripe on the panel: too few profiles show it"
-        curve = _fit_curve(band.u, state.centre, robust, degree)
-        residual = state.centre - curve.at(band.u)
+        enough &= np.count_nonzero(robust, axis=1) >= _MIN_POINTS
+        curves = _fit_curves(bands, state.centre, robust, 3, cubic)
+        residual = state.centre - curves.at(bands.u)
         standardised = residual / sigma
-        scale = max(_spread(standardised[weight > 0]), 1.0)
+        scale = np.maximum(np.where(enough, _spreads(standardised, known), 1.0), 1.0)[:, None]
         robust = weight * tukey_weights(standardised / scale)
     kept = np.where(np.abs(standardised) < 4.0 * scale, weight, 0.0)
-    spread = _spread((residual * band.cosine)[kept > 0])
-    if not spread < 0.5 * max(state.width, 1.0):
-        return "the bright line on the panel is not the narrow straight line that a laser makes"
-    return _Smooth(curve, kept, residual)
+    narrow = _spreads(residual * bands.cosine, kept > 0) < 0.5 * np.maximum(state.width, 1.0)
+    problems = [_TOO_FEW if not e else "" if n else _NOT_NARROW for e, n in zip(enough, narrow, strict=True)]
+    return _Smooth(curves, kept, residual, problems)
 
 
-def _points(band: _Band, smooth: _Smooth, steep: bool, state: _State) -> StripeFit | str:
-    """Merge blocks of neighbouring profiles; their scatter about the curve corrects what the noise model states."""
-    weight = smooth.weight
+def _points(bands: _Bands, smooth: _Smooth, steep: bool, state: _State, b: int) -> StripeFit | str:
+    """Merge blocks of neighbouring profiles of band `b`; their scatter about the curve corrects what the noise model
+    states."""
+    valid = bands.valid[b]
+    weight = smooth.weight[b, valid]
     length = _BLOCK if np.count_nonzero(weight) > _SHORT else _BLOCK // 2
-    block = np.floor(band.u / length).astype(int)
+    block = np.floor(bands.u[b, valid] / length).astype(int)
     block -= block[0]
     total = np.bincount(block, weight)
     enough = (np.bincount(block, weight > 0) >= length // 2) & (total > 0)
     safe = np.where(enough, total, 1.0)
-    columns = (band.u, smooth.residual, band.cosine, band.sine)
+    columns = (x[b, valid] for x in (bands.u, smooth.residual, bands.cosine, bands.sine))
     u, offset, cosine, sine = ((np.bincount(block, weight * x) / safe)[enough] for x in columns)
     sigma = 1.0 / np.sqrt(total[enough])
     if len(u) < _MIN_POINTS:
-        return "no stripe on the panel: too few profiles show it"
+        return _TOO_FEW
     freedom = np.sqrt(max(len(u) - 4, 1) / len(u))
-    inflation = max(_spread(offset / sigma) / freedom, 1.0)
+    inflation = max(MAD_TO_SIGMA * _quantile(np.abs(offset / sigma), 0.5) / freedom, 1.0)
     norm = np.hypot(cosine, sine)
     cosine, sine = cosine / norm, sine / norm
-    sigma = sigma * inflation * cosine
+    sigma = np.hypot(sigma * inflation, _MODEL_SIGMA_PX) * cosine
     # Points on dark squares beside points on light ones: a hundredth of their weight, and mostly trouble.
     best = _quantile(sigma, 0.2)
-    worth = sigma < max(8.0 * best, 0.1)
+    worth = sigma < np.clip(8.0 * best, 0.1, _WORST_SIGMA_PX)
+    if np.count_nonzero(worth) < max(_MIN_POINTS, len(u) // 2):
+        return _TOO_ROUGH
     u, offset, cosine, sine, sigma = u[worth], offset[worth], cosine[worth], sine[worth], sigma[worth]
     normals = np.stack([cosine, -sine] if steep else [-sine, cosine], axis=-1)
-    points = StripePoints(_pixels(u, smooth.curve.at(u) + offset, steep), normals, sigma)
-    return StripeFit(points, state.width, state.dark_ratio, inflation)
+    only = np.arange(len(smooth.problems)) == b
+    v = smooth.curves.take(only).at(u[None])[0] + offset
+    points = StripePoints(_pixels(u, v, steep), normals, sigma)
+    return StripeFit(points, float(state.width[b]), float(state.dark_ratio[b]), inflation)

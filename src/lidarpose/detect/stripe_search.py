@@ -100,13 +100,13 @@ class PanelView:
         return image[self.low[1] : self.high[1], self.low[0] : self.high[0]]
 
     def grid_and_slopes(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Grid coordinates (N, 2) at pixels (N, 2), and their derivatives (N, 4) as in `slopes`."""
+        """Grid coordinates (..., 2) at pixels (..., 2), and their derivatives (..., 4) as in `slopes`."""
         # By hand: remap rounds to 1/32 of a node's distance, which is a quarter of a pixel.
-        column, row = ((pixels[:, k] - self.low[k]) / _NODE_STEP for k in (0, 1))
+        column, row = ((pixels[..., k] - self.low[k]) / _NODE_STEP for k in (0, 1))
         height, width = self.nodes.shape[:2]
         i = np.clip(column.astype(np.intp), 0, width - 2)
         j = np.clip(row.astype(np.intp), 0, height - 2)
-        x, y = (column - i)[:, None], (row - j)[:, None]
+        x, y = (column - i)[..., None], (row - j)[..., None]
         found = []
         for table in (self.nodes, self.slopes):
             upper = table[j, i] * (1.0 - x) + table[j, i + 1] * x

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import chain, groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,6 +35,9 @@ if TYPE_CHECKING:
 Step = Callable[[], None]
 """Called after each image or scan that is done, for a progress bar."""
 
+
+IMAGES_AT_ONCE = 8
+"""Stripe images that are fitted together: enough that single ones cost little, few enough for memory and progress."""
 
 MOST_CONTRADICTING = 0.15
 """Share of the places with both stripes that may contradict the others before the whole is in doubt."""
@@ -216,7 +220,8 @@ def detect_features(session: TurntableSession, *, step: Step | None = None) -> D
         boards, finders = {}, {}
         for placement, sources in session.board_images.items():
             boards[placement], finders[placement] = _detect_board(session, placement, [s.load() for s in sources])
-        all_stripes = executor.map(lambda place: _find_stripes(finders, place), session.places)
+        batches = _batches(session.places)
+        all_stripes = chain.from_iterable(executor.map(lambda batch: _find_stripes(finders, batch), batches))
         places, left_out = [], []
         for place, lines, (stripes, problems) in zip(session.places, all_lines, all_stripes, strict=True):
             left_out += problems
@@ -259,14 +264,27 @@ def _find_scan_lines(session: TurntableSession, place: TurntablePlace) -> tuple[
     return find_lines(scan, session.lidar) or LeftOut(f"position {place.position}", "its scan has no straight line")
 
 
+def _batches(places: Sequence[TurntablePlace]) -> list[Sequence[TurntablePlace]]:
+    """Places in their order, some at a time, all of one placement of the board each time."""
+    groups = [list(group) for _, group in groupby(places, key=lambda place: place.placement)]
+    return [group[k : k + IMAGES_AT_ONCE] for group in groups for k in range(0, len(group), IMAGES_AT_ONCE)]
+
+
 def _find_stripes(
-    finders: Mapping[str, StripeFinder], place: TurntablePlace
-) -> tuple[Mapping[int, StripePoints], list[LeftOut]]:
-    """Stripes of a place by panel, and what was given up."""
-    if place.stripe_image is None:
-        return {}, []
-    detection = finders[place.placement].find(place.stripe_image.load())
-    return detection.stripes, [LeftOut(f"position {place.position}, {p.what}", p.reason) for p in detection.problems]
+    finders: Mapping[str, StripeFinder], places: Sequence[TurntablePlace]
+) -> list[tuple[Mapping[int, StripePoints], list[LeftOut]]]:
+    """Stripes of each place by panel, and what was given up; the places are all of one placement."""
+    images = [place.stripe_image.load() for place in places if place.stripe_image is not None]
+    detections = iter(finders[places[0].placement].find_in(images))
+    found: list[tuple[Mapping[int, StripePoints], list[LeftOut]]] = []
+    for place in places:
+        if place.stripe_image is None:
+            found.append(({}, []))
+            continue
+        detection = next(detections)
+        lost = [LeftOut(f"position {place.position}, {p.what}", p.reason) for p in detection.problems]
+        found.append((detection.stripes, lost))
+    return found
 
 
 def assign_lines(
