@@ -21,11 +21,11 @@ def mad_sigma(values: ArrayLike, *, centred: bool = False) -> float:
     x = np.asarray(values, dtype=np.float64)
     if x.size == 0:
         return float("nan")
-    centre = 0.0 if centred else _median(x)
-    return MAD_TO_SIGMA * _median(np.abs(x - centre))
+    centre = 0.0 if centred else median(x)
+    return MAD_TO_SIGMA * median(np.abs(x - centre))
 
 
-def _median(values: FloatArray) -> float:
+def median(values: FloatArray) -> float:
     """As numpy's, of all values, at a fraction of its overhead; NaN where a value is."""
     n = values.size
     # NaN sorts last.
