@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -27,6 +28,11 @@ def as_float_array(values: ArrayLike, shape: tuple[int | None, ...], name: str) 
 def unit(vectors: ArrayLike) -> FloatArray:
     """Vectors (..., n) scaled to length 1; raises ValueError where one has no direction."""
     array = np.asarray(vectors, dtype=np.float64)
+    if array.ndim == 1:  # most calls, and several times as fast as the general way
+        single = math.sqrt(array @ array)
+        if not single > 0.0:
+            raise ValueError("a vector of length zero has no direction")
+        return np.asarray(array / single)
     length = np.linalg.norm(array, axis=-1, keepdims=True)
     if not np.all(length > 0.0):
         raise ValueError("a vector of length zero has no direction")

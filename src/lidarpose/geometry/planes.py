@@ -65,10 +65,12 @@ class Plane:
     def intersect_plane(self, other: Plane) -> Line3:
         """Common line, its direction along ``cross(normal, other.normal)``. Raises ValueError if parallel."""
         direction = cross3(self.normal, other.normal)
-        if np.linalg.norm(direction) < 1e-9:
+        squared = float(direction @ direction)
+        if squared < 1e-18:
             raise ValueError("parallel planes have no common line")
-        system = np.stack([self.normal, other.normal, direction])
-        return Line3(np.linalg.solve(system, [self.offset, other.offset, 0.0]), direction)
+        # The common line's point nearest to the origin (Goldman, "Intersection of two planes", Graphics Gems).
+        point = self.offset * cross3(other.normal, direction) + other.offset * cross3(direction, self.normal)
+        return Line3(point / squared, direction)
 
 
 def intersect_three_planes(planes: tuple[Plane, Plane, Plane]) -> FloatArray:

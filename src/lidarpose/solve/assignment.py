@@ -32,7 +32,13 @@ from lidarpose.solve.light_plane import StripeOnPanel, StripePair, stripe_pair, 
 from lidarpose.solve.line_pair import FittedLine, fit_line_pair, fit_scan_line, free_directions
 from lidarpose.solve.panel_pose import PanelPose
 from lidarpose.solve.single_pose import single_pose
-from lidarpose.solve.turntable_function import fit_by_readings, motion_of_pair, require_readings, wide_pairs
+from lidarpose.solve.turntable_function import (
+    fit_by_readings,
+    information_in_own_frame,
+    motion_of_pair,
+    require_readings,
+    wide_pairs,
+)
 
 LEAST_STRIPE_POINTS = 5
 # Points of a stripe that the choice is made from.
@@ -329,10 +335,8 @@ def _details(places: Sequence[PlaceFeatures], reasons: Mapping[int, str]) -> tup
 
 
 def _pool(candidates: list[_Candidate], angles: FloatArray) -> _Pool:
-    information = []
-    for c in candidates:
-        Ad = c.sample.pose.inverse().adjoint()
-        information.append(np.linalg.inv(Ad @ c.sample.covariance @ Ad.T))
+    samples = [c.sample for c in candidates]
+    information = information_in_own_frame([s.pose for s in samples], [s.covariance for s in samples])
     place = np.array([c.place for c in candidates])
     return _Pool(
         tuple(candidates),
@@ -340,7 +344,7 @@ def _pool(candidates: list[_Candidate], angles: FloatArray) -> _Pool:
         angles[place],
         np.stack([c.sample.pose.rotation for c in candidates]),
         np.stack([c.sample.pose.translation for c in candidates]),
-        np.stack(information),
+        information,
         len(angles),
     )
 

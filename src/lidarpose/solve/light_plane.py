@@ -17,6 +17,8 @@ from lidarpose.model.observation import StripePoints
 HYPOTHESES = 80
 # Points at which hypotheses are scored; the fit itself uses all of them.
 SCORED_POINTS = 200
+# A light plane that turns by less than this from one step to the next has been found.
+SETTLED_RAD = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +147,10 @@ def fit_light_plane(stripes: Sequence[StripeOnPanel], *, seed: int = 0) -> Light
         scale = max(1.0, mad_sigma(standardised, centred=True))
         weight = tukey_weights(standardised / scale)
         refined = fit_plane(points, weight / sigma**2)
-        turned = np.linalg.norm(cross3(refined.normal, plane.normal))
+        turned = cross3(refined.normal, plane.normal)
         plane = refined
-        if turned < 1e-8:
+        # A hundredth of what the best stripes can tell.
+        if turned @ turned < SETTLED_RAD**2:
             break
     return _with_covariance(plane, points, spread, weight, groups, len(stripes))
 

@@ -146,7 +146,7 @@ def fit_by_readings(
         # Lenient at first: the start rests on two places, and the others lie off it by more than their noise.
         lenience = max(1.0, 16.0 / 2.0**k)
         scaled, weight = _reweigh(_residuals(angles, R, t, T_w, T_m), information, floor, lenience)
-        T_w, T_m = _fit_motion(angles, R, t, scaled * weight[:, None, None], T_w, T_m, steps=2)
+        T_w, T_m = _fit_motion(angles, R, t, scaled * weight[:, None, None], T_w, T_m, steps=1)
         if lenience == 1.0 and np.abs(weight - previous).max() < 1e-3:
             break
     T_w, T_m = _fit_motion(angles, R, t, scaled * weight[:, None, None], T_w, T_m, steps=10)
@@ -264,11 +264,18 @@ def _information(poses: Sequence[Pose], covariances: Sequence[FloatArray] | None
         sigma_r = max(float(np.median(np.linalg.norm(residuals[:, 3:], axis=1))) / 1.538, LEAST_SCALE)
         diagonal = np.diag([sigma_t**-2] * 3 + [sigma_r**-2] * 3)
         return np.broadcast_to(diagonal, (len(poses), 6, 6))
-    own = []
-    for pose, covariance in zip(poses, covariances, strict=True):
-        Ad = pose.inverse().adjoint()
-        own.append(np.linalg.inv(Ad @ covariance @ Ad.T))
-    return np.stack(own)
+    return information_in_own_frame(poses, covariances)
+
+
+def information_in_own_frame(poses: Sequence[Pose], covariances: Sequence[FloatArray]) -> FloatArray:
+    """Information (N, 6, 6) of poses in their own (the child's) frame, from covariances of left perturbations."""
+    R = np.stack([p.rotation for p in poses])
+    t = np.stack([p.translation for p in poses])
+    # The inverse of Ad(T^-1) is Ad(T), so that no matrix but the covariance is inverted.
+    Ad = np.zeros((len(R), 6, 6))
+    Ad[:, :3, :3] = Ad[:, 3:, 3:] = R
+    Ad[:, :3, 3:] = skew(t) @ R
+    return np.asarray(Ad.swapaxes(1, 2) @ np.linalg.inv(np.stack(covariances)) @ Ad)
 
 
 def _reweigh(

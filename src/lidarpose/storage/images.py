@@ -86,11 +86,12 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _decode(path: Path, data: bytes) -> GrayImage:
-    image = _fast_png(data)
-    if image is not None:
-        return image
+    grey = _fast_png(data)
+    if grey is not None:
+        return grey
     import cv2
 
+    image = None
     if data:
         try:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
