@@ -108,7 +108,8 @@ def spread_of_ranges(estimate: TurntableEstimate) -> float:
 def expected_axis_error(estimate: TurntableEstimate) -> tuple[float, float]:
     """Standard deviations of the centre's place across the axis (m) and of the axis' tilt in the LiDAR frame (rad)."""
     C = estimate.motion_covariance
-    tilt = np.sqrt(np.trace(C[7:9, 7:9]) + np.trace(C[3:5, 3:5]))
+    # In the LiDAR frame the axis depends on its mounting alone; turns about the turntable's x and y tilt it.
+    tilt = np.sqrt(np.trace(C[7:9, 7:9]))
     sideways = estimate.motion.radius_m**2 * C[9, 9]
     return float(np.sqrt(C[6, 6] + sideways)), float(tilt)
 
