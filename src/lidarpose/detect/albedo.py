@@ -24,7 +24,7 @@ from lidarpose.model.image import GrayImage
 MARGIN = 0.9
 # Inside a square, away from its blurred edges, as fractions of it.
 _INNER = np.linspace(0.25, 0.75, 5)
-_SQRT2 = np.sqrt(2.0)
+_SQRT2 = math.sqrt(2.0)
 # The error function in steps of 0.002: a table is ten times as fast as the function, and as good as 12 bits.
 _ERF_REACH, _ERF_STEPS = 3.2, 3200
 

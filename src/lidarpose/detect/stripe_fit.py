@@ -7,7 +7,8 @@ light dark squares send back are common to all. Gauss and Newton's method, all p
 elimination of the others. The noise's variance, r^2 + g * level + (s * signal)^2 (reading, shots, speckle), is learnt
 from the residuals.
 
-The images of one panel are fitted several at once, as tables of B bands, N profiles each and P pixels a profile: single
+The images of one panel are fitted several at once, as tables of B bands, N profiles each and P pixels a profile (P
+first: NumPy is fast along the last axis, and profiles are short): single
 ones are so small that calling NumPy would take most of the time. Shorter bands are filled up with profiles that are not
 `valid`. Nothing passes from one band to another.
 """
@@ -121,9 +122,9 @@ class _Ranges:
 
 @dataclass(frozen=True, eq=False)
 class _Bands:
-    """Profiles along the stripes, as tables (B, N, P).
+    """Profiles along the stripes, as tables (P, B, N): what belongs to a profile, (B, N), combines with them as it is.
 
-    u, valid : (B, N); v : (B, N, P) pixel coordinates; values, bright : grey levels; good : pixels that count;
+    u, valid : (B, N); v : (P, B, N) pixel coordinates; values, bright : grey levels; good : pixels that count;
     ambient : light that was taken out of the values; cosine, sine : (B, N) of the stripe's inclination;
     light : share of light surface that each pixel sees.
     """
@@ -141,7 +142,7 @@ class _Bands:
 
     @property
     def half(self) -> int:
-        return int(self.v.shape[2] // 2)
+        return int(self.v.shape[0] // 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,16 +311,16 @@ def _cut(source: _Source, ranges: _Ranges, curves: _Curves, half: FloatArray) ->
     """Profiles of 2 half + 1 pixels about the curves; `half` (B,) may differ from band to band."""
     view, steep = source.view, source.steep
     reach = int(half.max())
-    offsets = np.arange(-reach, reach + 1)
-    v = np.rint(curves.at(ranges.u)).astype(np.intp)[..., None] + offsets
+    offsets = np.arange(-reach, reach + 1)[:, None, None]
+    v = np.rint(curves.at(ranges.u)).astype(np.intp) + offsets
     across = 0 if steep else 1
     safe = np.clip(v, view.low[across], view.high[across] - 1)
-    along = ranges.u.astype(np.intp)[..., None]
+    along = ranges.u.astype(np.intp)
     rows, columns = (along, safe) if steep else (safe, along)
     index = rows * source.images[0].shape[1] + columns
-    values = np.stack([image.take(i) for image, i in zip(source.images, index, strict=True)])
+    values = np.stack([image.take(index[:, b]) for b, image in enumerate(source.images)], axis=1)
     bright = view.bright.take((rows - view.low[1]) * view.bright.shape[1] + (columns - view.low[0]))
-    within = ranges.valid[..., None] & (np.abs(offsets) <= half[:, None, None])
+    within = ranges.valid & (np.abs(offsets) <= half[:, None])
     good = ((v == safe) & (values < 0.98 * source.limit) & within).astype(np.float32)
     slope = curves.slope(ranges.u)
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
@@ -339,44 +340,40 @@ def _half_heights(curves: _Curves, ranges: _Ranges, width: FloatArray) -> FloatA
 def _bands_about(source: _Source, ranges: _Ranges, curves: _Curves, width: FloatArray) -> _Bands:
     """The bands about good curves, with the ambient light taken out and the first backgrounds."""
     bands = _cut(source, ranges, curves, _half_heights(curves, ranges, width))
-    flank = bands.good * (np.abs(_distance(bands, curves.at(bands.u))) > _table(2.7 * width))
+    flank = bands.good * (np.abs(_distance(bands, curves.at(bands.u))) > _single(2.7 * width))
     ambient = _ambient(bands, flank, curves)
     return replace(bands, values=bands.values - ambient, ambient=ambient)
 
 
 def _distance(bands: _Bands, centre: FloatArray) -> FloatArray:
-    """Distance (B, N, P) of the pixels from the stripe's centre line."""
-    return np.asarray((bands.v - _column(centre)) * _column(bands.cosine))
+    """Distance (P, B, N) of the pixels from the stripe's centre line."""
+    return np.asarray((bands.v - _single(centre)) * _single(bands.cosine))
 
 
-def _column(values: FloatArray) -> FloatArray:
-    """Values (B, N) of profiles, to be used with (B, N, P)."""
-    return np.asarray(values, dtype=np.float32)[..., None]
-
-
-def _table(values: FloatArray) -> FloatArray:
-    """Values (B,) of bands, to be used with (B, N, P)."""
-    return np.asarray(values, dtype=np.float32)[:, None, None]
+def _single(values: FloatArray) -> FloatArray:
+    """Values of profiles (B, N), or of bands (B,), in the precision of the tables (P, B, N) they are used with."""
+    single = np.asarray(values, dtype=np.float32)
+    return single if single.ndim == 2 else single[:, None]
 
 
 def _first_curves(bands: _Bands, share: FloatArray, straight: _Curves) -> tuple[_Curves, FloatArray, BoolArray]:
     """Curves within about a pixel, from the brightest pixel of each profile, the stripes' rough widths (B,), and
     whether there is a ridge at all (B,)."""
-    rest = bands.values - _table(share) * bands.bright
-    rest -= rest.mean(axis=2, keepdims=True)
+    rest = bands.values - _single(share) * bands.bright
+    rest -= rest.mean(axis=0)
     smooth = rest.copy()
-    smooth[..., 1:-1] = 0.25 * rest[..., :-2] + 0.5 * rest[..., 1:-1] + 0.25 * rest[..., 2:]
-    peak = np.argmax(smooth, axis=2)[..., None]
-    height = np.take_along_axis(smooth, peak, axis=2)[..., 0]
-    v = np.take_along_axis(bands.v, peak, axis=2)[..., 0].astype(np.float64)
+    smooth[1:-1] = 0.25 * rest[:-2] + 0.5 * rest[1:-1] + 0.25 * rest[2:]
+    peak = np.argmax(smooth, axis=0)[None]
+    height = np.take_along_axis(smooth, peak, axis=0)[0]
+    v = np.take_along_axis(bands.v, peak, axis=0)[0].astype(np.float64)
     strong = bands.valid & (height > 0.4 * _quantiles(height, bands.valid, 0.75)[:, None])
     near, is_ridge, curves = strong, np.ones(len(v), dtype=bool), straight
     for reach in (8.0, 4.0, 2.5):
         near = strong & (np.abs(v - curves.at(bands.u)) <= reach)
         is_ridge &= np.count_nonzero(near, axis=1) >= _MIN_POINTS
         curves = _fit_curves(bands, v, near.astype(np.float64), 2)
-    window = np.clip(peak + np.arange(-9, 10), 0, rest.shape[2] - 1)
-    area = np.maximum(np.take_along_axis(rest, window, axis=2), 0.0).sum(axis=2) / np.maximum(height, 1e-3)
+    window = np.clip(peak + np.arange(-9, 10)[:, None, None], 0, len(rest) - 1)
+    area = np.maximum(np.take_along_axis(rest, window, axis=0), 0.0).sum(axis=0) / np.maximum(height, 1e-3)
     cosine = 1.0 / np.sqrt(1.0 + curves.slope(bands.u) ** 2)
     # Speckle makes the highest pixel too high, by this much typically, and the width too small.
     width = 1.15 * _quantiles(area * cosine, near, 0.5) / np.sqrt(2.0 * np.pi)
@@ -426,36 +423,34 @@ def _spreads(values: FloatArray, which: BoolArray) -> FloatArray:
 def _start(bands: _Bands, curves: _Curves, width: FloatArray, ratio: FloatArray, noise: FloatArray | None) -> _State:
     """Heights and backgrounds by least squares with all else as given; a guess of the noise from the pixels beside."""
     centre = curves.at(bands.u)
-    distance = _distance(bands, centre) * _table(1.0 / width)
-    bell = np.exp(np.float32(-0.5) * distance * distance) * (_table(ratio) + _table(1.0 - ratio) * bands.light)
+    distance = _distance(bands, centre) * _single(1.0 / width)
+    bell = np.exp(np.float32(-0.5) * distance * distance) * (_single(ratio) + _single(1.0 - ratio) * bands.light)
     weighted = bands.good * bell
-    n, b, v = (np.einsum("bnp,bnp->bn", bands.good, x) for x in (np.ones_like(bell), bell, bands.values))
-    bb, bv = (np.einsum("bnp,bnp->bn", weighted, x) for x in (bell, bands.values))
+    n, b, v = (np.einsum("pbn,pbn->bn", bands.good, x) for x in (np.ones_like(bell), bell, bands.values))
+    bb, bv = (np.einsum("pbn,pbn->bn", weighted, x) for x in (bell, bands.values))
     det = np.maximum(n * bb - b * b, 1e-3)
     height = np.maximum((n * bv - b * v) / det, 1.0)
     background = (v - height * b) / np.maximum(n, 1.0)
     if noise is None:
         flank = bands.good * (np.abs(distance) > 2.7)
-        rest = np.abs(bands.values - background[..., None]) * flank
-        reading = 1.25 * rest.sum(axis=(1, 2)) / np.maximum(flank.sum(axis=(1, 2)), 1.0)
+        rest = np.abs(bands.values - _single(background)) * flank
+        reading = 1.25 * rest.sum(axis=(0, 2)) / np.maximum(flank.sum(axis=(0, 2)), 1.0)
         noise = np.stack([np.maximum(reading, 0.3) ** 2, np.zeros(len(ratio)), np.zeros(len(ratio))], axis=1)
     return _State(height, centre, background, width, ratio, noise, np.ones_like(centre))
 
 
 def _ambient(bands: _Bands, flank: FloatArray, curves: _Curves) -> FloatArray:
     """The bright image times a share that changes slowly along the stripe, from the pixels beside it (`flank`)."""
-    count = np.maximum(flank.sum(axis=2, keepdims=True), 1.0)
-    values, bright = (
-        flank * (x - (x * flank).sum(axis=2, keepdims=True) / count) for x in (bands.values, bands.bright)
-    )
+    count = np.maximum(flank.sum(axis=0), 1.0)
+    values, bright = (flank * (x - (x * flank).sum(axis=0) / count) for x in (bands.values, bands.bright))
     s = (bands.u - curves.middle) / curves.half
     powers = np.stack([np.ones_like(s), s, s**2], axis=2)
-    own, cross = np.einsum("bnp,bnp->bn", bright, bright), np.einsum("bnp,bnp->bn", bright, values)
+    own, cross = np.einsum("pbn,pbn->bn", bright, bright), np.einsum("pbn,pbn->bn", bright, values)
     normal = (powers * own[..., None]).swapaxes(1, 2) @ powers
     # Flat profiles tell nothing: a weak pull towards no ambient light.
     normal += np.eye(3) * (1e-6 * np.trace(normal, axis1=1, axis2=2) + 1.0)[:, None, None]
     share = np.linalg.solve(normal, powers.swapaxes(1, 2) @ cross[..., None].astype(np.float64))
-    return np.asarray(_column((powers @ share)[..., 0]) * bands.bright)
+    return np.asarray(_single((powers @ share)[..., 0]) * bands.bright)
 
 
 def _look_at_albedo(bands: _Bands, source: _Source, curves: _Curves, width: FloatArray) -> _Bands:
@@ -473,13 +468,13 @@ def _look_at_albedo(bands: _Bands, source: _Source, curves: _Curves, width: Floa
     thickness = (1.0 - blur2 / width**2)[:, None]
     edges = np.sqrt(blur2[:, None, None] * (thickness[..., None] * across**2 + along**2))
     # A pixel at (0, dv) from the centre is seen at dv along the stripe's tangent plus `thickness` of it across.
-    dv = bands.v - _column(centre)
+    dv = bands.v - _single(centre)
     per_v = by_v * (cosine**2 * thickness + sine**2)[..., None]
     per_v = per_v + by_u * ((1.0 - thickness) * cosine * sine)[..., None]
     inside = _inside_squares(view, grid, across, width)
-    x, y = (dv * _column(per_v[..., k]) + _column(grid[..., k]) for k in (0, 1))
-    light = albedo.light_share(x, y, _column(edges[..., 0]), _column(edges[..., 1]))
-    return replace(bands, cosine=cosine, sine=sine, light=light, good=bands.good * inside[..., None])
+    x, y = (dv * _single(per_v[..., k]) + _single(grid[..., k]) for k in (0, 1))
+    light = albedo.light_share(x, y, _single(edges[..., 0]), _single(edges[..., 1]))
+    return replace(bands, cosine=cosine, sine=sine, light=light, good=bands.good * inside)
 
 
 def _inside_squares(view: PanelView, grid: FloatArray, across: FloatArray, width: FloatArray) -> FloatArray:
@@ -494,21 +489,21 @@ def _inside_squares(view: PanelView, grid: FloatArray, across: FloatArray, width
 
 def _step(bands: _Bands, state: _State, curves: _Curves, *, learn: bool) -> _State:
     """One Gauss-Newton step; with `learn`, the noise is learnt again first."""
-    distance = _distance(bands, state.centre) * _table(1.0 / state.width)
+    distance = _distance(bands, state.centre) * _single(1.0 / state.width)
     squared = distance * distance
     bell = np.exp(np.float32(-0.5) * squared)
-    ratio, height = _table(state.dark_ratio), _column(state.height)
+    ratio, height = _single(state.dark_ratio), _single(state.height)
     by_height = bell * (ratio + (1 - ratio) * bands.light)
     signal = height * by_height
-    residual = bands.values - _column(state.background) - signal
+    residual = bands.values - _single(state.background) - signal
     level = np.maximum(bands.values + bands.ambient, np.float32(0.0))
     noise = _learn_noise(residual, level, signal, bands.good, state.noise) if learn else state.noise
-    variance = _table(noise[:, 0]) + _table(noise[:, 1]) * level + _table(noise[:, 2]) * signal * signal
+    variance = _single(noise[:, 0]) + _single(noise[:, 1]) * level + _single(noise[:, 2]) * signal * signal
     weight = bands.good / variance
     J = [
         np.ones_like(signal),
         by_height,
-        signal * distance * _column(bands.cosine / state.width[:, None]),
+        signal * distance * _single(bands.cosine / state.width[:, None]),
         signal * squared,
     ]
     M = _normal_equations(J, residual, weight)
@@ -536,7 +531,7 @@ def _normal_equations(J: Sequence[FloatArray], residual: FloatArray, weight: Flo
     rows: list[FloatArray] = []
     for i in range(len(J)):
         weighted = J[i] * weight
-        products = [np.einsum("bnp,bnp->bn", weighted, other) for other in (*J[i:], residual)]
+        products = [np.einsum("pbn,pbn->bn", weighted, other) for other in (*J[i:], residual)]
         rows.append(np.stack(products).astype(np.float64))
     return rows
 
@@ -567,7 +562,7 @@ def _dark_ratios(bands: _Bands, state: _State) -> FloatArray:
 
     Not fitted with the rest: its product with the heights makes a bad start worse.
     """
-    share = bands.light[..., bands.half]
+    share = bands.light[bands.half]
     on_light, on_dark = bands.valid & (share > 0.98), bands.valid & (share < 0.02)
     enough = np.minimum(np.count_nonzero(on_light, axis=1), np.count_nonzero(on_dark, axis=1)) >= 20
     light, dark = (_quantiles(state.height, which, 0.5) for which in (on_light, on_dark))
@@ -579,7 +574,7 @@ def _learn_noise(
     residual: FloatArray, level: FloatArray, signal: FloatArray, good: FloatArray, before: FloatArray
 ) -> FloatArray:
     """Variance as r^2 + g * level + s^2 * signal^2 (all >= 0), from residuals sorted into bins by the signal."""
-    bins = [_noise_bins(*(x[b].ravel() for x in (residual, level, signal, good))) for b in range(len(good))]
+    bins = [_noise_bins(*(x[:, b].ravel() for x in (residual, level, signal, good))) for b in range(len(before))]
     learnt = np.array([b for b, found in enumerate(bins) if found is not None], dtype=np.intp)
     noise = before.copy()
     if len(learnt):
