@@ -20,7 +20,7 @@ from lidarpose.model.observation import PlaceObservation, ScanLine, TurntableObs
 from lidarpose.model.targets import Panel
 from lidarpose.model.turntable_result import TurntableEstimate
 from lidarpose.refine.turntable import JointOptions, refine_turntable
-from lidarpose.refine.turntable_model import regular_motion
+from lidarpose.refine.turntable_state import regular_motion
 from lidarpose.solve.panel_pose import panel_pose
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"

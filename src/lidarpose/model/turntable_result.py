@@ -98,7 +98,7 @@ class ExtraParameter:
     Attributes
     ----------
     name
-        "range_offset_m" and the like; see `lidarpose.refine.turntable_model.EXTRAS`.
+        "range_offset_m" and the like; see `lidarpose.refine.turntable_parameters.EXTRAS`.
     value, sigma
         Estimate and standard deviation in the unit of the name; for one that was only tested, of one linear step.
     estimated

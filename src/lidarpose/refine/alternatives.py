@@ -15,7 +15,8 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.model.observation import PanelCorners, PlaceObservation, ScanLine, StripePoints, TurntableObservations
 from lidarpose.model.turntable_result import Kind
 from lidarpose.refine.turntable_joint import JointOptions, Solution, lines_of, solve_joint
-from lidarpose.refine.turntable_model import lay_out, start_state
+from lidarpose.refine.turntable_layout import lay_out
+from lidarpose.refine.turntable_state import start_state
 
 _MOST_PLACES = 9
 _MOST_ROWS = 50

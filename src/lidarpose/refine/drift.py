@@ -16,7 +16,8 @@ import numpy as np
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.model.observation import PanelCorners
 from lidarpose.model.turntable_result import Kind
-from lidarpose.refine.turntable_model import N_MOTION, JointData
+from lidarpose.refine.turntable_layout import JointData
+from lidarpose.refine.turntable_parameters import N_MOTION
 
 _SMOOTH_TERMS = 5
 _SIGNIFICANT_DRIFT = 1.6

@@ -17,7 +17,8 @@ from lidarpose.model.turntable_result import Direction
 from lidarpose.refine.observability import PoseSpread, pose_spread, weak_directions, whole_turn
 from lidarpose.refine.turntable_estimate import outside_parameters, require_determined
 from lidarpose.refine.turntable_joint import at_stated_noise
-from lidarpose.refine.turntable_model import lay_out, start_state
+from lidarpose.refine.turntable_layout import lay_out
+from lidarpose.refine.turntable_state import start_state
 
 _SAMPLES = 16
 

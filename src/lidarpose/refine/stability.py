@@ -10,7 +10,8 @@ from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.refine.least_squares import add_lines, covariance_and_condition
 from lidarpose.refine.turntable_estimate import OutsideParameters
 from lidarpose.refine.turntable_joint import Moments, Solution, all_moments, lines_of, reduced_moments
-from lidarpose.refine.turntable_model import N_GLOBAL, N_MOTION, motion_map
+from lidarpose.refine.turntable_parameters import N_GLOBAL, N_MOTION
+from lidarpose.refine.turntable_state import motion_map
 
 
 @dataclass(frozen=True)

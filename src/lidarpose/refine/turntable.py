@@ -30,7 +30,9 @@ from lidarpose.refine.turntable_estimate import (
     tested_extras,
 )
 from lidarpose.refine.turntable_joint import JointOptions, Solution, solve_joint
-from lidarpose.refine.turntable_model import EXTRAS, lay_out, start_state
+from lidarpose.refine.turntable_layout import lay_out
+from lidarpose.refine.turntable_parameters import EXTRAS
+from lidarpose.refine.turntable_state import start_state
 from lidarpose.refine.verdict import Evidence, judge
 
 __all__ = ["JointOptions", "refine_turntable"]

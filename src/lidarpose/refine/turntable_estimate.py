@@ -15,7 +15,9 @@ from lidarpose.model.turntable import PARAMETER_NAMES, TurntableMotion
 from lidarpose.model.turntable_result import ExtraParameter, Kind, NoiseEstimate, ResidualGroup
 from lidarpose.refine.observability import pose_spread, weak_directions, whole_turn
 from lidarpose.refine.turntable_joint import JointOptions, Solution, lines_of
-from lidarpose.refine.turntable_model import EXTRAS, N_GLOBAL, N_MOTION, Slot, motion_map
+from lidarpose.refine.turntable_layout import Slot
+from lidarpose.refine.turntable_parameters import EXTRAS, N_GLOBAL, N_MOTION
+from lidarpose.refine.turntable_state import motion_map
 
 _PANEL_PARTS = ("tx_m", "ty_m", "tz_m", "rx_rad", "ry_rad", "rz_rad")
 _HOPELESS_M, _HOPELESS_RAD = 0.5, np.deg2rad(30.0)

@@ -32,21 +32,16 @@ from lidarpose.refine.least_squares import (
 )
 from lidarpose.refine.noise import information_correction, robust_scale, taper_weights
 from lidarpose.refine.place_effects import place_variance
-from lidarpose.refine.turntable_model import (
-    CAMERA_EXTRAS,
-    EXTRAS,
-    N_GLOBAL,
-    N_MOTION,
+from lidarpose.refine.turntable_layout import JointData, Lines, thinned
+from lidarpose.refine.turntable_parameters import CAMERA_EXTRAS, EXTRAS, N_GLOBAL, N_MOTION
+from lidarpose.refine.turntable_residuals import (
     CornerResiduals,
-    JointData,
-    JointState,
     LineResiduals,
-    Lines,
     corner_residuals,
     range_residuals,
     stripe_residuals,
-    thinned,
 )
+from lidarpose.refine.turntable_state import JointState
 
 Moments = dict[Kind, FloatArray]
 """By kind: `line_moments` (S, b + 3, b + 3)."""
@@ -61,7 +56,7 @@ class JointOptions:
     Attributes
     ----------
     estimate
-        Extra parameters, names of `lidarpose.refine.turntable_model.EXTRAS`.
+        Extra parameters, names of `lidarpose.refine.turntable_parameters.EXTRAS`.
     use_stripes
         False: work from boards and scans alone.
     want_mm, want_deg

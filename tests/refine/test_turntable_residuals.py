@@ -6,17 +6,9 @@ import pytest
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.refine.turntable_joint import linearise, lines_of
-from lidarpose.refine.turntable_model import (
-    EXTRAS,
-    N_GLOBAL,
-    JointData,
-    JointState,
-    lay_out,
-    motion_map,
-    regular_motion,
-    start_state,
-    thinned,
-)
+from lidarpose.refine.turntable_layout import JointData, lay_out, thinned
+from lidarpose.refine.turntable_parameters import EXTRAS, N_GLOBAL
+from lidarpose.refine.turntable_state import JointState, motion_map, regular_motion, start_state
 from lidarpose.simulate.observations import simulate_observations
 from lidarpose.simulate.rig import TurntableRig, draw_rig
 
