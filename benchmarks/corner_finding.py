@@ -15,7 +15,7 @@ from collections import Counter
 
 import numpy as np
 
-from lidarpose.errors import UndeterminedError
+from lidarpose.errors import InputError, UndeterminedError
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.corner_session import CornerSession
 from lidarpose.simulate.corner_scene import CornerSceneSpec, CornerTruth, paper_rotation, simulate_corner_session
@@ -43,7 +43,7 @@ def random_scene(seed: int) -> tuple[CornerSceneSpec, CornerSession, CornerTruth
         try:
             session, truth = simulate_corner_session(spec)
             check_layout(session)
-        except (ValueError, UndeterminedError):
+        except (ValueError, InputError, UndeterminedError):
             continue
         return spec, session, truth
 

@@ -36,6 +36,17 @@ WIDEST = 3.0
 # A patch is connected across gaps of this share of its range, which spans the lines of a 16-beam LiDAR on a slope.
 GAP_PER_RANGE = 0.06
 MIN_GAP_M = 0.04
+# Of the voxels within twice a patch's thickness, the share that lies within it; and its thickness over its width.
+STANDS_OUT = 0.7
+THIN = 0.15
+EVIDENCE_POINTS = 20_000
+# The second screening: neighbours that make a point's own normal, points asked, and how many have to agree how well.
+SCREENING_NEIGHBOURS = 12
+SCREENING_WIDTH = 1.5
+LINED_UP = 0.15
+SCREENED_POINTS = 200
+SCREENING_RAD = np.radians(25.0)
+SCREENED_SHARE = 0.55
 # Sine of the angle below which a surface counts as seen edge-on.
 EDGE_ON = 0.06
 
@@ -184,6 +195,8 @@ def _harvest(x: Float32Array, free: BoolArray, sample: _Sample, least: int, at_m
         if patch is None or len(patch) < least:
             dead[hypothesis] = True
             dead |= sample.near[component].sum(axis=0) > 0.8 * component.sum()
+            # What looked most like a plane here and is none would look so from many sides: no more votes from it.
+            active[component] = 0.0
             continue
         patches.append(patch)
         free[patch.indices] = False
@@ -296,7 +309,8 @@ def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, comp
     occupied = np.zeros(raster.shape[0] * raster.shape[1] + 1, dtype=bool)
     occupied[raster.cells(seen)] = True
     allowed = np.append(_grown(occupied[:-1].reshape(raster.shape)).ravel(), False)
-    reach = np.float32(WIDEST * GATE_SIGMAS * sample.sigma_m)
+    # Twice the widest slab: what lies just outside it tells a plane from something else.
+    reach = np.float32(2.0 * WIDEST * GATE_SIGMAS * sample.sigma_m)
     distance = x @ plane.normal.astype(np.float32) - np.float32(plane.offset)
     near = np.flatnonzero((np.abs(distance) < reach) & free)
     local = x[near]
@@ -314,13 +328,58 @@ def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, comp
             return None
         normal, offset, variances = _moments(local, inside)
         sigma_m = _spread(distance[inside], sample.sigma_m)
-    # A plane stands out from what is around it: a slab through scattered clutter does not.
-    around = int(np.count_nonzero(np.abs(distance) < 2.0 * GATE_SIGMAS * sigma_m))
-    if np.count_nonzero(inside) < 0.6 * around or not _is_thin(variances, sigma_m):
+    if not _is_thin(variances, sigma_m) or not _stands_out(local, normal, offset, sigma_m):
         return None
     offset += float(normal @ centre)
     final = Plane(normal, offset) if offset <= 0.0 else Plane(-normal, -offset)
     return PlanePatch(final, near[inside], sigma_m)
+
+
+def _stands_out(local: Float32Array, normal: FloatArray, offset: float, sigma_m: float) -> bool:
+    """Whether a plane is more than a slab through something else: a scanner's mount, clutter, a dense blob.
+
+    Of the points (M, 3) around it, the slab has to hold most of what lies up to twice as far off, and to be thin
+    beside both its extents. One point a voxel counts: where beams crowd, as at the pole of a turntable, they are no
+    more evidence than elsewhere, and whatever lies there would look flat.
+    """
+    points = local[:: max(len(local) // EVIDENCE_POINTS, 1)]
+    points = points[_one_a_voxel(points, GATE_SIGMAS * sigma_m)]
+    height = np.abs(points @ normal.astype(np.float32) - np.float32(offset))
+    inside = height < GATE_SIGMAS * sigma_m
+    around = height < 2.0 * GATE_SIGMAS * sigma_m
+    if np.count_nonzero(inside) < max(STANDS_OUT * np.count_nonzero(around), 4.0):
+        return False
+    variances = np.linalg.eigvalsh(np.cov(points[inside].T.astype(np.float64)))
+    return bool(variances[0] < THIN**2 * variances[1]) and _neighbours_agree(points[around], normal, sigma_m)
+
+
+def _neighbours_agree(points: Float32Array, normal: FloatArray, sigma_m: float) -> bool:
+    """The corner paper's second screening, of a whole patch: whether the normals that points (V, 3) have by their own
+    neighbours are mostly the plane's. Neighbours along one scan line, no wider than the noise, have no normal; where
+    most are such, nobody is asked."""
+    from scipy.spatial import cKDTree
+
+    if len(points) <= SCREENING_NEIGHBOURS:
+        return True
+    seeds = points[:: max(len(points) // SCREENED_POINTS, 1)]
+    _, neighbours = cKDTree(points).query(seeds, k=SCREENING_NEIGHBOURS)
+    around = points[neighbours].astype(np.float64)
+    d = around - around.mean(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", d, d, optimize=False) / SCREENING_NEIGHBOURS)
+    known = (values[:, 1] > (SCREENING_WIDTH * sigma_m) ** 2) & (values[:, 1] > LINED_UP * values[:, 2])
+    if np.count_nonzero(known) < 0.5 * len(known):
+        return True
+    agree = np.abs(vectors[known, :, 0] @ normal) > np.cos(SCREENING_RAD)
+    return bool(np.count_nonzero(agree) >= SCREENED_SHARE * len(agree))
+
+
+def _one_a_voxel(points: Float32Array, side_m: float) -> IntArray:
+    """The first point (V,) in each cube of the side that holds any of points (M, 3)."""
+    cells = np.floor(points / np.float32(side_m)).astype(np.int64)
+    cells -= cells.min(axis=0)
+    extent = cells.max(axis=0) + 1
+    flat = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+    return np.asarray(np.unique(flat, return_index=True)[1], dtype=np.int64)
 
 
 def _moments(local: Float32Array, inside: BoolArray) -> tuple[FloatArray, float, FloatArray]:
