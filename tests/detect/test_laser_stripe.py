@@ -56,6 +56,44 @@ def test_stripes_lie_where_the_sheet_is(two_panels, shots, finder, azimuth_deg, 
         assert 0.3 < np.median(np.abs(error / points.sigma_px)) < 1.2
 
 
+@pytest.mark.parametrize("azimuth_deg", [84.0, 5.0])
+def test_rows_and_columns_are_alike(two_panels, shots, finder, azimuth_deg) -> None:
+    normal, offset = sheet(azimuth_deg, (-0.09 if azimuth_deg < 45.0 else 0.0, 0.013, 1.0))
+    image = two_panels.noisy(two_panels.stripe(normal, offset, 0.0011), np.random.default_rng(3))
+    found = finder.find(image)
+    mirrored = [np.ascontiguousarray(shot.T) for shot in shots]
+    panels = [board.panel for board in two_panels.boards]
+    other = StripeFinder(find_panels(mirrored, panels), mirrored).find(np.ascontiguousarray(image.T))
+    assert found.stripes
+    expected = [points for _, points in sorted(found.stripes.items())]
+    for points in other.stripes.values():
+        # Mirroring may exchange the panels, which have the same size.
+        twin = min(expected, key=lambda p: np.linalg.norm(p.pixels.mean(axis=0) - points.pixels.mean(axis=0)[::-1]))
+        assert len(points) == pytest.approx(len(twin), abs=3)
+        nearest = np.argmin(((points.pixels[:, None, ::-1] - twin.pixels) ** 2).sum(-1), axis=1)
+        off = ((points.pixels[:, ::-1] - twin.pixels[nearest]) * twin.normals[nearest]).sum(-1)
+        assert np.median(np.abs(off / twin.sigma_px[nearest])) < 0.5
+        assert np.median(points.sigma_px) == pytest.approx(np.median(twin.sigma_px), rel=0.15)
+    assert len(other.stripes) == len(found.stripes)
+
+
+def test_images_fitted_together_do_not_matter_to_each_other(two_panels, finder) -> None:
+    rng = np.random.default_rng(5)
+    images = [np.zeros((two_panels.height, two_panels.width), np.uint8)]
+    for azimuth_deg in (90.0, 5.0, 75.0, 130.0):
+        normal, offset = sheet(azimuth_deg, (-0.09 if azimuth_deg < 45.0 else 0.0, 0.013, 1.0))
+        images.append(two_panels.noisy(two_panels.stripe(normal, offset, 0.0011, 60.0 + azimuth_deg), rng))
+    together = finder.find_in([images[k] for k in (2, 1, 0, 4, 3)])
+    assert not together[2].stripes
+    for image, found in zip((images[k] for k in (2, 1, 0, 4, 3)), together, strict=True):
+        alone = finder.find(image)
+        assert alone.problems == found.problems
+        assert alone.stripes.keys() == found.stripes.keys()
+        for k, points in alone.stripes.items():
+            np.testing.assert_allclose(found.stripes[k].pixels, points.pixels, atol=1e-3)
+            np.testing.assert_allclose(found.stripes[k].sigma_px, points.sigma_px, rtol=1e-2)
+
+
 @pytest.mark.parametrize("level", [25.0, 1500.0])
 def test_faint_and_saturated_stripes(two_panels, finder, level) -> None:
     normal, offset = sheet(84.0, (0.0, 0.013, 1.0))

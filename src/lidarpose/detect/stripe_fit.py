@@ -115,9 +115,12 @@ class _Ranges:
         return _Ranges(self.u[which], self.valid[which])
 
     def thinned(self) -> _Ranges:
-        """About `_FEW` profiles of the longest band, and as large a share of the others."""
-        step = max(self.u.shape[1] // _FEW, 1)
-        return _Ranges(self.u[:, ::step], self.valid[:, ::step])
+        """About `_FEW` profiles of each band, evenly spread."""
+        count = np.count_nonzero(self.valid, axis=1)
+        step = np.maximum(count // _FEW, 1)[:, None]
+        index = np.arange(int((count[:, None] / step).max()) + 1) * step
+        valid = index < count[:, None]
+        return _Ranges(np.take_along_axis(self.u, np.where(valid, index, 0), axis=1), valid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +219,7 @@ def _fit_alike(source: _Source, lines: Sequence[CoarseLine]) -> list[StripeFit |
     if len(alive) == 0:
         return found
     source, ranges, straight = source.take(long_enough), ranges.take(long_enough), straight.take(long_enough)
-    few = ranges.thinned() if ranges.valid.sum(axis=1).min() > _FEW else ranges
+    few = ranges.thinned()
     half = np.full(len(alive), _FIRST_HALF)
     curves, width, is_ridge = _first_curves(_cut(source, few, straight, half), share[long_enough], straight)
     for k in alive[~is_ridge]:
@@ -460,7 +463,7 @@ def _look_at_albedo(bands: _Bands, source: _Source, curves: _Curves, width: Floa
     centre, slope = curves.at(bands.u), curves.slope(bands.u)
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
     sine = slope * cosine
-    grid, slopes = view.grid_and_slopes(_pixels(centre, bands.u, True) if steep else _pixels(bands.u, centre, False))
+    grid, slopes = view.grid_and_slopes(_pixels(bands.u, centre, steep))
     by_u, by_v = (slopes[..., 1::2], slopes[..., ::2]) if steep else (slopes[..., ::2], slopes[..., 1::2])
     across = by_v * cosine[..., None] - by_u * sine[..., None]
     along = by_u * cosine[..., None] + by_v * sine[..., None]
@@ -587,8 +590,8 @@ def _learn_noise(
 
 def _noise_bins(residual: FloatArray, level: FloatArray, signal: FloatArray, good: FloatArray) -> FloatArray | None:
     """Variance, mean level and mean squared signal (3, bins) of one band's pixels; None if they are too few."""
-    step = max(good.size // _NOISE_SAMPLES, 1)
-    some = np.flatnonzero(good[::step]) * step
+    some = np.flatnonzero(good)
+    some = some[:: max(len(some) // _NOISE_SAMPLES, 1)]
     if len(some) < 12 * _NOISE_BINS:
         return None
     some = some[: len(some) // _NOISE_BINS * _NOISE_BINS]
