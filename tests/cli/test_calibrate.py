@@ -216,3 +216,37 @@ def test_an_offset_of_all_beam_angles_is_explained_not_estimated(
     command = ["calibrate", str(simulated_session), "-o", str(tmp_path), "--estimate", "beam-angle-offset"]
     assert run(command) == 2
     assert "turn of the LiDAR about its own z axis" in capsys.readouterr().err
+
+
+def test_readings_off_by_a_factor_are_mended_by_the_calibration_file(
+    simulated_session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Far from zero, where a factor that was lost on the way would turn the LiDAR by degrees."""
+    session, factor, shift = copy_session(simulated_session, tmp_path / "session"), 1.01, 200.0
+
+    def misread(text: str) -> str:
+        head, *rows = text.splitlines()
+        column = head.split(",").index("turntable_angle_deg")
+        cells = [row.split(",") for row in rows]
+        for row in cells:
+            row[column] = repr(factor * (float(row[column]) + shift))
+        return "\n".join([head, *(",".join(row) for row in cells)]) + "\n"
+
+    edit_text(session / "positions.csv", misread)
+    command = ["calibrate", str(session), "-o", str(tmp_path / "out"), "--no-report", "--quiet"]
+    assert run([*command, "--estimate", "encoder-scale"]) == 0
+    calibration = read_turntable_calibration(tmp_path / "out" / "calibration.json")
+    truth = read_turntable_truth(simulated_session)
+    assert truth is not None
+    for true_deg in (2.0, 10.0, 20.0):
+        found = calibration.uncertain_pose(float(np.deg2rad(factor * (true_deg + shift))))
+        assert found is not None
+        xi = found.pose.minus(truth.pose(float(np.deg2rad(true_deg))))
+        assert xi @ np.linalg.solve(found.covariance, xi) < 22.5
+        assert np.linalg.norm(xi[3:]) < np.deg2rad(0.15)
+    capsys.readouterr()
+    assert (
+        run(["export", str(tmp_path / "out" / "calibration.json"), "--to", "urdf", "-o", str(tmp_path / "rig.urdf")])
+        == 2
+    )
+    assert "off by a factor" in capsys.readouterr().err

@@ -210,9 +210,10 @@ def test_an_encoder_scale_enters_pose_and_covariance() -> None:
     on = refine(rig, scaled, estimate=("encoder_scale",))
     fitted = {e.name: e for e in on.extras}["encoder_scale"]
     assert fitted.sigma < 1e-3
-    assert abs(on.reading_scale - 1.01) < 4.0 * fitted.sigma
+    assert abs(on.motion.reading_scale - 1.01) < 4.0 * fitted.sigma
     true = float(rig.turntable_angle_rad[7])
-    pose = on.uncertain_pose(true / 1.01)
+    pose = on.calibration().uncertain_pose(true / 1.01)
+    assert pose is not None
     xi = pose.pose.minus(rig.motion.pose(true))
     assert xi @ np.linalg.solve(pose.covariance, xi) < 20.0
 

@@ -51,11 +51,20 @@ def export(
     import math
 
     from lidarpose.errors import InputError
+    from lidarpose.model.calibration import TurntableCalibration
     from lidarpose.storage.calibration import read_calibration
     from lidarpose.storage.camera_files import read_camera
     from lidarpose.storage.exports import ExportOptions, FrameNames, write_export
 
     loaded = read_calibration(calibration)
+    scale = loaded.motion.reading_scale if isinstance(loaded, TurntableCalibration) else 1.0
+    one_pose = to == "ros2" and angle_deg is not None
+    if scale != 1.0 and to != "csv" and not one_pose:
+        raise InputError(
+            calibration,
+            f"has readings that are off by a factor ({scale:.6g}); {to} knows none",
+            expected="--to csv, or --to ros2 with --angle-deg for one pose",
+        )
     if camera is not None and to not in ("kalibr", "opencv"):
         raise InputError("--camera", f"has no place in {to}", expected="--to kalibr or --to opencv")
     options = ExportOptions(

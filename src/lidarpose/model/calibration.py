@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -22,6 +22,18 @@ class Quality:
     verdict: Verdict
     reasons: tuple[str, ...] = ()
     figures: Mapping[str, Any] = field(default_factory=dict)
+
+
+def uncertain_pose_at(
+    motion: TurntableMotion, names: Sequence[str], covariance: FloatArray, turntable_angle_rad: float
+) -> UncertainPose:
+    """T_camera_lidar with its covariance at a reading, from that (n, n) of the named parameters, motion first."""
+    J = motion.pose_jacobian(turntable_angle_rad)
+    keep = [*range(len(PARAMETER_NAMES))]
+    if "encoder_scale" in names:
+        keep.append(list(names).index("encoder_scale"))
+        J = np.column_stack([J, motion.pose_by_scale(turntable_angle_rad)])
+    return UncertainPose(motion.pose(turntable_angle_rad), J @ covariance[np.ix_(keep, keep)] @ J.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +68,9 @@ class TurntableCalibration:
 
     def uncertain_pose(self, turntable_angle_rad: float) -> UncertainPose | None:
         """T_camera_lidar with its covariance at a reading of the turntable; None where no uncertainty is known."""
-        if self.motion_covariance is None:
+        if self.parameter_covariance is None:
             return None
-        J = self.motion.pose_jacobian(turntable_angle_rad)
-        return UncertainPose(self.pose(turntable_angle_rad), J @ self.motion_covariance @ J.T)
+        return uncertain_pose_at(self.motion, self.parameter_names, self.parameter_covariance, turntable_angle_rad)
 
     def transform_covariances(self) -> tuple[FloatArray, FloatArray] | None:
         """The 6x6 covariances of ``T_camera_turntable`` and ``T_turntable_lidar``, each by itself."""

@@ -8,6 +8,7 @@ the translation (r, 0, 0), with r the radius of the centre's circle.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -29,6 +30,8 @@ PARAMETER_NAMES = (
 """The ten numbers of a turntable motion, as small changes: the left perturbation of ``T_camera_turntable``, the
 radius, and the left rotation of ``T_turntable_lidar`` with its translation held."""
 
+Angles = TypeVar("Angles", float, FloatArray)
+
 RADIUS_TO_TWIST = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -40,10 +43,18 @@ class TurntableMotion:
     ------
     ValueError
         If `T_turntable_lidar` has a translation other than (r, 0, 0) with r >= 0 (to a micrometre).
+
+    Attributes
+    ----------
+    reading_scale, reading_origin_rad
+        Of a turntable whose readings are off by a factor: it stands at origin + scale * (reading - origin). 1 and 0
+        otherwise.
     """
 
     T_camera_turntable: Pose
     T_turntable_lidar: Pose
+    reading_scale: float = 1.0
+    reading_origin_rad: float = 0.0
 
     def __post_init__(self) -> None:
         x, y, z = self.T_turntable_lidar.translation
@@ -82,9 +93,19 @@ class TurntableMotion:
         """Unit direction (3,) of the axis in the camera frame; the turntable turns right-handed about it."""
         return self.T_camera_turntable.rotation[:, 2]
 
+    def true_angle(self, reading_rad: Angles) -> Angles:
+        """Where the turntable stands at a reading, or at readings (N,)."""
+        return self.reading_origin_rad + self.reading_scale * (reading_rad - self.reading_origin_rad)
+
+    @property
+    def in_true_angles(self) -> TurntableMotion:
+        """The same motion as a function of where the turntable stands, not of what it reads."""
+        return TurntableMotion(self.T_camera_turntable, self.T_turntable_lidar)
+
     def pose(self, turntable_angle_rad: float) -> Pose:
         """T_camera_lidar at a reading of the turntable."""
-        return self.T_camera_turntable @ Pose.rot_z(turntable_angle_rad) @ self.T_turntable_lidar
+        turn = Pose.rot_z(self.true_angle(turntable_angle_rad))
+        return self.T_camera_turntable @ turn @ self.T_turntable_lidar
 
     def pose_jacobian(self, turntable_angle_rad: float) -> FloatArray:
         """Derivative (6, 10) of the left perturbation of ``pose(angle)`` by `PARAMETER_NAMES`."""
@@ -94,5 +115,9 @@ class TurntableMotion:
         # Turning the LiDAR about its own centre, not about the turntable's origin.
         mounting[:3, 1:] = skew(t)
         mounting[3:, 1:] = np.eye(3)
-        to_camera = (self.T_camera_turntable @ Pose.rot_z(turntable_angle_rad)).adjoint()
+        to_camera = (self.T_camera_turntable @ Pose.rot_z(self.true_angle(turntable_angle_rad))).adjoint()
         return np.hstack([np.eye(6), to_camera @ mounting])
+
+    def pose_by_scale(self, turntable_angle_rad: float) -> FloatArray:
+        """Derivative (6,) of the left perturbation of ``pose(angle)`` by `reading_scale`."""
+        return self.T_camera_turntable.adjoint()[:, 5] * (turntable_angle_rad - self.reading_origin_rad)

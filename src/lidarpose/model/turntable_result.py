@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose, UncertainPose
-from lidarpose.model.calibration import Quality, TurntableCalibration
+from lidarpose.model.calibration import Quality, TurntableCalibration, uncertain_pose_at
 from lidarpose.model.observation import LeftOut
 from lidarpose.model.turntable import TurntableMotion
 
@@ -168,7 +168,6 @@ class TurntableEstimate:
     extras: tuple[ExtraParameter, ...]
     quality: Quality
     findings: tuple[str, ...] = ()
-    reading_scale: float = 1.0
     extra_values: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -178,22 +177,7 @@ class TurntableEstimate:
 
     def uncertain_pose(self, turntable_angle_rad: float) -> UncertainPose:
         """T_camera_lidar with its covariance at a reading of the turntable."""
-        angle = self.reading_scale * turntable_angle_rad
-        J = self.motion.pose_jacobian(angle)
-        if "encoder_scale" in self.parameter_names:
-            return self._uncertain_pose_with_scale(turntable_angle_rad, J)
-        return UncertainPose(self.motion.pose(angle), J @ self.motion_covariance @ J.T)
-
-    def _uncertain_pose_with_scale(self, reading: float, J_motion: FloatArray) -> UncertainPose:
-        import numpy as np
-
-        index = self.parameter_names.index("encoder_scale")
-        keep = [*range(10), index]
-        turn = self.motion.T_camera_turntable.adjoint()[:, 5] * reading
-        J = np.column_stack([J_motion, turn])
-        return UncertainPose(
-            self.motion.pose(self.reading_scale * reading), J @ self.parameter_covariance[np.ix_(keep, keep)] @ J.T
-        )
+        return uncertain_pose_at(self.motion, self.parameter_names, self.parameter_covariance, turntable_angle_rad)
 
     def calibration(self, provenance: Mapping[str, Any] | None = None) -> TurntableCalibration:
         """What goes into the calibration file."""

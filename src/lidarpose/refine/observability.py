@@ -24,8 +24,11 @@ class PoseSpread:
 
 
 def pose_spread(motion: TurntableMotion, covariance: FloatArray, angles_rad: FloatArray) -> PoseSpread:
-    """The pose's standard deviations (root of the summed variances) from the covariance (10, 10) of the motion."""
-    J_centre, J_turn = _effects(motion, angles_rad)
+    """The pose's standard deviations (root of the summed variances) from the covariance (10, 10) of the motion.
+
+    An eleventh row and column are of the readings' scale.
+    """
+    J_centre, J_turn = _effects(motion, angles_rad, with_scale=len(covariance) > 10)
     position = np.einsum("mij,jk,mik->m", J_centre, covariance, J_centre)
     rotation = np.einsum("mij,jk,mik->m", J_turn, covariance, J_turn)
     return PoseSpread(angles_rad, np.sqrt(np.maximum(position, 0.0)), np.sqrt(np.maximum(rotation, 0.0)))
@@ -36,9 +39,17 @@ def whole_turn(middle_rad: float) -> FloatArray:
     return np.asarray(middle_rad + _TURN)
 
 
-def _effects(motion: TurntableMotion, angles_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (M, 3, 10) of the LiDAR's centre and of its orientation, in the camera frame."""
+def _effects(
+    motion: TurntableMotion, angles_rad: FloatArray, *, with_scale: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives (M, 3, 10) of the LiDAR's centre and of its orientation, in the camera frame.
+
+    With the readings' scale as an eleventh number, (M, 3, 11).
+    """
     J = np.array([motion.pose_jacobian(float(a)) for a in angles_rad])
+    if with_scale:
+        by_scale = np.array([motion.pose_by_scale(float(a)) for a in angles_rad])
+        J = np.concatenate([J, by_scale[:, :, None]], axis=2)
     centres = np.array([motion.pose(float(a)).translation for a in angles_rad])
     return J[:, :3] - skew(centres) @ J[:, 3:], J[:, 3:]
 

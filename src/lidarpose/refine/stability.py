@@ -39,8 +39,8 @@ def leave_places_out(solution: Solution, outside: OutsideParameters, parts: int 
         return None
     moments = all_moments(data, solution.at, solution.noise)
     reduced = {kind: reduced_moments(moments[kind], solution.noise.lines[kind]) for kind in moments}
-    to_motion = motion_map(solution.state, outside.motion, data.reference_rad)[:, :N_MOTION]
-    to_pose = outside.motion.pose_jacobian((1.0 + float(solution.state.extras[0])) * data.reference_rad) @ to_motion
+    to_motion = motion_map(solution.state, outside.motion, data.reference_rad)
+    to_pose = outside.motion.pose_jacobian(data.reference_rad) @ to_motion
     worst: Stability | None = None
     for block in np.array_split(order, min(parts, len(order))):
         gone = np.isin(np.arange(len(order)), block)

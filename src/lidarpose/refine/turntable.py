@@ -136,7 +136,7 @@ def _assemble(
     stability = leave_places_out(solution, outside)
     directions = weak_directions(outside.motion, outside.covariance[:10, :10], angles)
     outside = paid_for(outside, effects)
-    C = outside.covariance[:10, :10]
+    C = _of_motion(outside)
     noise = noise_estimates(solution)
     evidence = Evidence(
         noise=noise,
@@ -179,9 +179,14 @@ def _assemble(
         extras=extras,
         quality=quality,
         findings=(*evidence.findings, *evidence.duplicates),
-        reading_scale=float(1.0 + solution.state.extras[0]),
         extra_values={n: float(solution.state.extras[EXTRAS.index(n)]) for n in options.estimate},
     )
+
+
+def _of_motion(outside: OutsideParameters) -> FloatArray:
+    """Covariance (10, 10) of the motion, (11, 11) with the readings' scale where that is estimated."""
+    keep = [*range(10), *(k for k, name in enumerate(outside.names) if name == "encoder_scale")]
+    return np.asarray(outside.covariance[np.ix_(keep, keep)])
 
 
 def _judged_extras(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,7 +47,7 @@ def outside_parameters(solution: Solution) -> OutsideParameters:
     motion = state.to_motion(data.reference_rad)
     n = N_GLOBAL + 6 * len(data.slots)
     to_outside = np.zeros((n, n))
-    to_outside[:N_MOTION, : N_MOTION + 1] = motion_map(state, motion, data.reference_rad)
+    to_outside[:N_MOTION, :N_MOTION] = motion_map(state, motion, data.reference_rad)
     to_outside[N_MOTION:N_GLOBAL, N_MOTION:N_GLOBAL] = np.eye(len(EXTRAS))
     for k, pose in enumerate(state.panels):
         at = slice(N_GLOBAL + 6 * k, N_GLOBAL + 6 * k + 6)
@@ -217,12 +217,10 @@ def move_of_extra(solution: Solution, outside: OutsideParameters, name: str, val
         outside.from_inside @ (-solution.covariance @ solution.equations.information[use, p] * value), dtype=np.float64
     )
     if name == "encoder_scale":
-        by_scale = motion_map(solution.state, outside.motion, solution.data.reference_rad)[:, N_MOTION] * value
-        readings = (1.0 + float(solution.state.extras[0])) * _arc(solution)
-        J = np.concatenate([outside.motion.pose_jacobian(float(r)) for r in readings])
-        twist = outside.motion.T_camera_turntable.adjoint()[:, 5]
-        turned = np.concatenate([twist * r * value for r in readings])
-        move[:N_MOTION] += by_scale + np.linalg.lstsq(J, turned, rcond=1e-9)[0]
+        about_middle = replace(outside.motion, reading_origin_rad=solution.data.reference_rad)
+        J = np.concatenate([outside.motion.pose_jacobian(float(r)) for r in _arc(solution)])
+        turned = np.concatenate([about_middle.pose_by_scale(float(r)) * value for r in _arc(solution)])
+        move[:N_MOTION] += np.linalg.lstsq(J, turned, rcond=1e-9)[0]
     return move
 
 

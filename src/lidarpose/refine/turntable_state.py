@@ -9,7 +9,7 @@ determined whatever the axis is. `JointState.to_motion` and `motion_map` lead to
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -69,10 +69,12 @@ class JointState:
         )
 
     def to_motion(self, reference_rad: float) -> TurntableMotion:
-        """The motion in the fixed frames; readings are to be multiplied by 1 + the encoder's scale."""
+        """The motion in the fixed frames, with the encoder's scale about the reference reading."""
         G = self.T_camera_axis
-        zero = Pose.rot_z(-(1.0 + self.extras[0]) * reference_rad)
-        return regular_motion(G, zero @ G.inverse() @ self.T_camera_lidar)
+        motion = regular_motion(G, Pose.rot_z(-reference_rad) @ G.inverse() @ self.T_camera_lidar)
+        if self.extras[0] == 0.0:
+            return motion
+        return replace(motion, reading_scale=1.0 + float(self.extras[0]), reading_origin_rad=reference_rad)
 
 
 def _tidy(pose: Pose) -> Pose:
@@ -113,15 +115,11 @@ def start_state(data: JointData, motion: TurntableMotion, panels: Mapping[str, t
 
 
 def motion_map(state: JointState, motion: TurntableMotion, reference_rad: float) -> FloatArray:
-    """Derivative (10, 11) of `PARAMETER_NAMES` by the internal ten numbers and the encoder's scale.
+    """Derivative (10, 10) of `PARAMETER_NAMES` by the internal ten numbers; the encoder's scale is the same in both.
 
     Both describe the same poses, so it follows from the poses' derivatives at three readings.
     """
-    scale = 1.0 + state.extras[0]
-    readings = reference_rad + np.array([-2.1, 0.0, 2.1]) / scale
+    readings = reference_rad + np.array([-2.1, 0.0, 2.1]) / (1.0 + state.extras[0])
     _, _, J_inside = state.turned(readings, reference_rad)
-    # Inside, the scale turns the LiDAR from the reference reading on; in the fixed frames from reading 0 on.
-    J_inside[:, :, 10] = -reference_rad * state.T_camera_axis.adjoint()[:, 5]
-    outside = [motion.pose_jacobian(float(scale * reading)) for reading in readings]
-    J_outside = np.concatenate(outside)
-    return np.asarray(np.linalg.lstsq(J_outside, np.concatenate(list(J_inside)), rcond=None)[0])
+    J_outside = np.concatenate([motion.pose_jacobian(float(reading)) for reading in readings])
+    return np.asarray(np.linalg.lstsq(J_outside, np.concatenate(list(J_inside[:, :, :10])), rcond=None)[0])

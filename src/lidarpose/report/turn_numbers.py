@@ -9,6 +9,7 @@ import numpy as np
 
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import UncertainPose, skew
+from lidarpose.model.calibration import uncertain_pose_at
 from lidarpose.model.turntable_run import TurntableRun
 
 DISTANCES_M = (1.5, 3.0)
@@ -71,15 +72,10 @@ def uncertain_pose_of(run: TurntableRun) -> Callable[[float], UncertainPose] | N
     if run.estimate is not None:
         return run.estimate.uncertain_pose
     calibration = run.calibration
-    if calibration.motion_covariance is None:
+    names, covariance = calibration.parameter_names, calibration.parameter_covariance
+    if covariance is None:
         return None
-    motion, covariance = calibration.motion, calibration.motion_covariance
-
-    def at(angle_rad: float) -> UncertainPose:
-        J = motion.pose_jacobian(angle_rad)
-        return UncertainPose(motion.pose(angle_rad), J @ covariance @ J.T)
-
-    return at
+    return lambda angle_rad: uncertain_pose_at(calibration.motion, names, covariance, angle_rad)
 
 
 def arc_deg(run: TurntableRun) -> tuple[float, float]:

@@ -6,6 +6,7 @@ A reader needs `format`, `kind` and `transforms` alone, as files of other progra
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -46,6 +47,11 @@ class _ParametersEntry(_Lenient):
     covariance: list[list[float]]
 
 
+class _ReadingsEntry(_Lenient):
+    scale: Annotated[float, Field(gt=0.0)]
+    origin_rad: float
+
+
 class _QualityEntry(_Lenient):
     model_config = ConfigDict(extra="allow", frozen=True)
     verdict: Literal["good", "doubtful", "rejected"]
@@ -57,6 +63,7 @@ class _CalibrationFile(_Lenient):
     kind: Literal["turntable", "world"]
     transforms: Annotated[list[_TransformEntry], Field(min_length=1)]
     scale: Annotated[float, Field(gt=0.0)] = 1.0
+    readings: _ReadingsEntry | None = None
     parameters: _ParametersEntry | None = None
     quality: _QualityEntry | None = None
     provenance: dict[str, Any] = {}
@@ -90,6 +97,9 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         "transforms": transforms,
         "scale": float(scale),
     }
+    if isinstance(calibration, TurntableCalibration) and calibration.motion.reading_scale != 1.0:
+        motion = calibration.motion
+        document["readings"] = {"scale": motion.reading_scale, "origin_rad": motion.reading_origin_rad}
     if calibration.parameter_covariance is not None:
         document["parameters"] = {
             "names": list(calibration.parameter_names),
@@ -155,6 +165,9 @@ def _turntable(path: Path, file: _CalibrationFile, quality: Quality | None) -> T
     table, table_covariance = _transform(path, file, "camera", "turntable")
     lidar, lidar_covariance = _transform(path, file, "turntable", "lidar")
     motion = TurntableMotion.from_any_frame(table, lidar)
+    if file.readings is not None:
+        # A turntable frame with another x reads the same angles: the origin is one of readings.
+        motion = replace(motion, reading_scale=file.readings.scale, reading_origin_rad=file.readings.origin_rad)
     names, covariance = _parameters(path, file)
     if covariance is None or names[: len(PARAMETER_NAMES)] != PARAMETER_NAMES:
         names, covariance = PARAMETER_NAMES, None

@@ -21,7 +21,7 @@ from lidarpose.measure.planes import MeasuredPlane, joined_planes
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.recording import SweepRecording
-from lidarpose.workflows.scanning import require_times
+from lidarpose.workflows.scanning import in_true_angles, require_times
 
 # Ranges without any noise are still rounded to float32.
 _LEAST_NOISE_M = 1e-5
@@ -62,6 +62,8 @@ def view_of_recording(recording: SweepRecording, calibration: TurntableCalibrati
     UndeterminedError
         If there are too few returns.
     """
+    recording = in_true_angles(recording, calibration)
+    calibration = replace(calibration, motion=calibration.motion.in_true_angles)
 
     def moved(change: FloatArray, index: IntArray) -> Beams:
         return chosen_beams(recording, calibration.motion, index, change)
@@ -90,6 +92,8 @@ def view_of_cloud(cloud: Cloud, calibration: TurntableCalibration | None) -> Mea
     if len(points) < 100:
         raise UndeterminedError("The cloud holds too few points to measure anything", remedy="Give a denser cloud.")
     if calibration is not None:
+        # A cloud tells where the table stood, not what it read.
+        calibration = replace(calibration, motion=calibration.motion.in_true_angles)
         recording = recording_from_cloud(points, calibration.motion, light)
         if recording is not None:
             view = view_of_recording(recording, calibration)

@@ -94,13 +94,15 @@ def assemble_scan(
         )
     if options.never_stops and not recording.has_reading_per_beam:
         require_times(recording)
-    motion = _fold_in(calibration.motion, world)
+    true_calibration = replace(calibration, motion=calibration.motion.in_true_angles)
+    motion = _fold_in(true_calibration.motion, world)
     compiled = pays_to_compile(recording)
 
     def cloud(first: int, part: SweepRecording) -> Cloud:
         if options.never_stops and not recording.has_reading_per_beam:
             part = replace(part, turntable_angle_deg=readings_between(recording, first, first + part.sweeps))
-        return _cloud(part, first, calibration, options, world, motion, compiled)
+        part = in_true_angles(part, calibration)
+        return _cloud(part, first, true_calibration, options, world, motion, compiled)
 
     # One part is assembled while the one before is written.
     with ThreadPoolExecutor(1) as ahead:
@@ -112,6 +114,14 @@ def assemble_scan(
             waiting = following
         if waiting is not None:
             yield waiting.result()
+
+
+def in_true_angles(recording: SweepRecording, calibration: TurntableCalibration) -> SweepRecording:
+    """The recording with the table's angles in place of readings that are off by the calibration's factor."""
+    if calibration.motion.reading_scale == 1.0:
+        return recording
+    readings = np.deg2rad(np.asarray(recording.turntable_angle_deg, dtype=np.float64))
+    return replace(recording, turntable_angle_deg=np.rad2deg(calibration.motion.true_angle(readings)))
 
 
 def require_times(recording: SweepRecording) -> None:
