@@ -108,8 +108,8 @@ def study(settings: dict[Setting, int]) -> dict[Setting, _Studied]:
 
 def run(effort: Effort) -> Report:
     axes = AXES if not effort.quick else (replace(AXES[0], values=(1, 2)),)
-    settings = {axis.setting(value): effort.pick(6, 2) for axis in axes for value in axis.values}
-    settings[Setting()] = effort.pick(16, 2)
+    settings = {axis.setting(value): effort.pick(5, 2) for axis in axes for value in axis.values}
+    settings[Setting()] = effort.pick(12, 2)
     studied = study(settings)
     middle = studied[Setting()]
     joint, paper = middle.over_bound(JOINT), middle.over_bound(PAPER)

@@ -236,10 +236,10 @@ def study(settings: dict[Setting, int]) -> dict[Setting, _Studied]:
 
 
 def run(effort: Effort) -> Report:
-    runs = effort.pick(8, 2)
+    runs = effort.pick(6, 2)
     axes = AXES if not effort.quick else tuple(replace(a, values=a.values[:2]) for a in AXES[:2])
     settings = {axis.setting(value): runs for axis in axes for value in axis.values}
-    settings[Setting()] = effort.pick(32, 4)
+    settings[Setting()] = effort.pick(24, 4)
     studied = study(settings)
     middle = studied[Setting()]
     joint, paper = (rms(middle.errors[m]) / middle.bound for m in (JOINT, PAPER))
