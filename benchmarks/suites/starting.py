@@ -25,11 +25,11 @@ PROGRAMS: dict[str, list[str]] = {
 
 def run(effort: Effort) -> Report:
     installed = {name: p for name, p in PROGRAMS.items() if name != "import open3d" or _has_open3d()}
-    warm = interleaved({name: _program(p) for name, p in installed.items()}, effort.pick(15, 3))
+    warm = interleaved({name: _program(p) for name, p in installed.items()}, effort.pick(15, 3), budget_s=5.0)
     with tempfile.TemporaryDirectory() as folder:
         ways = {name: _cold(p, Path(folder)) for name, p in installed.items() if "open3d" not in name}
         # Every run finds another empty folder for byte code, so none of them is warm.
-        cold = interleaved(ways, effort.pick(5, 2))
+        cold = interleaved(ways, effort.pick(5, 2), budget_s=8.0)
     figures = {
         "start.import_s": warm["import lidarpose"],
         "start.help_s": warm["lidarpose --help"],
