@@ -41,8 +41,10 @@ from lidarpose.storage.exports import ExportOptions, write_export
 from lidarpose.storage.images import FileImage
 from lidarpose.storage.packets import read_packets
 from lidarpose.storage.recording import read_recording, write_recording
+from lidarpose.storage.scene import read_scene
 from lidarpose.storage.session import read_scan
 from tests_support import bags
+from tests_support.session_folders import SCENE, load_corners, load_turntable, make_corners, make_turntable
 from tests_support.velodyne import write_pcap
 
 SECONDS = 2.0
@@ -104,7 +106,7 @@ def _bag(kind: str) -> Callable[[Path], tuple[Path, Path]]:
         bag = bags.write_bag(folder, kind, entries)
         if bag.is_file():
             return bag, bag
-        return next(f for f in bag.iterdir() if f.suffix in (".db3", ".mcap")), bag
+        return next(f for f in bag.iterdir() if f.suffix in (".db3", ".mcap", ".zstd")), bag
 
     return make
 
@@ -173,6 +175,43 @@ def _pcap(folder: Path) -> tuple[Path, Path]:
     return folder / "v.pcap", folder / "v.pcap"
 
 
+def _turntable(damaged: str) -> Callable[[Path], tuple[Path, Path]]:
+    def make(folder: Path) -> tuple[Path, Path]:
+        session = make_turntable(folder)
+        return session / damaged, session
+
+    return make
+
+
+def _corners(damaged: str) -> Callable[[Path], tuple[Path, Path]]:
+    def make(folder: Path) -> tuple[Path, Path]:
+        session = make_corners(folder)
+        return session / damaged, session
+
+    return make
+
+
+def _scene(folder: Path) -> tuple[Path, Path]:
+    (folder / "scene.toml").write_text(SCENE)
+    return folder / "scene.toml", folder / "scene.toml"
+
+
+def _metadata(kind: str) -> Callable[[Path], tuple[Path, Path]]:
+    def make(folder: Path) -> tuple[Path, Path]:
+        bag = _bag(kind)(folder)[1]
+        return bag / "metadata.yaml", bag
+
+    return make
+
+
+def _transforms_json(folder: Path) -> tuple[Path, Path]:
+    pose = {"translation_m": [0.1, 0, 1e-3], "quaternion_xyzw": [0, 0, 0, 1]}
+    document = {"format": "lidarpose/calibration@1", "kind": "world", "scale": 1.0}
+    document["transforms"] = [{"parent": "world", "child": "lidar", **pose}]
+    (folder / "t.json").write_text(json.dumps(document))
+    return folder / "t.json", folder / "t.json"
+
+
 def _crc32c_table() -> list[int]:
     table = []
     for value in range(256):
@@ -196,20 +235,36 @@ def mend_e57(data: bytes) -> bytes:
     return b"".join(pages)
 
 
+_TURNTABLE_FILES = (
+    "session.toml",
+    "positions.csv",
+    "camera.yaml",
+    "scans/0.csv",
+    "stripes/0.png",
+    "board/here/00.png",
+)
+_RECORDING_FILES = ("range_m.npy", "turntable_angle_deg.npy", "beam_angle_deg.npy", "time_s.npy", "recording.toml")
+
 READERS = [
     *(Reader(f"cloud{s}", _clouds(s), read_cloud) for s in (".ply", ".pcd", ".las", ".laz", ".e57", ".npy", ".xyz")),
     *(Reader(f"pcd {e}", _pcd(e), read_cloud) for e in ("ascii", "binary_compressed")),
     Reader("e57 with checksums", _clouds(".e57"), read_cloud, mend_e57),
     Reader("ply ascii", _ascii_ply, read_cloud),
-    *(Reader(f"bag {k}", _bag(k), _import) for k in ("ros1", "ros1-lz4", "ros1-bz2", "sqlite3", "mcap", "mcap-zstd")),
+    *(Reader(f"bag {k}", _bag(k), _import) for k in bags.KINDS),
+    *(Reader(f"metadata {k}", _metadata(k), _import) for k in ("sqlite3", "sqlite3-zstd-file", "mcap")),
     Reader("bag clouds", _cloud_bag, _import),
     Reader("camera_info", _camera_yaml, read_camera),
     Reader("opencv yaml", _exported_camera("opencv", "c.yml"), read_camera),
     Reader("opencv xml", _exported_camera("opencv", "c.xml"), read_camera),
     Reader("kalibr", _exported_camera("kalibr", "c.yaml"), read_camera),
     Reader("calibration", _calibration_json, read_calibration),
+    Reader("transforms alone", _transforms_json, read_calibration),
     Reader("scan csv", _scan_csv, read_scan),
-    *(Reader(f"recording {n}", _recording(n), read_recording) for n in ("range_m.npy", "time_s.npy", "recording.toml")),
+    Reader("scene", _scene, read_scene),
+    *(Reader(f"session {n}", _turntable(n), load_turntable) for n in _TURNTABLE_FILES),
+    Reader("session truth", _turntable("../session.truth.json"), load_turntable),
+    *(Reader(f"corners {n}", _corners(n), load_corners) for n in ("session.toml", "positions.csv", "clouds/p0/0.pcd")),
+    *(Reader(f"recording {n}", _recording(n), read_recording) for n in _RECORDING_FILES),
     Reader("image", _png, lambda path: FileImage(path, "i.png", 64, 48).load()),
     Reader("packets", _pcap, lambda path: list(read_packets(path))),
 ]

@@ -7,12 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lz4.frame import compress as lz4_compress
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-KINDS = ("ros1", "ros1-lz4", "ros1-bz2", "sqlite3", "sqlite3-zstd-message", "sqlite3-zstd-file", "mcap", "mcap-zstd")
+KINDS = (
+    *("ros1", "ros1-lz4", "ros1-bz2"),
+    *("sqlite3", "sqlite3-zstd-message", "sqlite3-zstd-file"),
+    *("mcap", "mcap-zstd", "mcap-lz4"),
+)
 
 _STORES = {True: get_typestore(Stores.ROS1_NOETIC), False: get_typestore(Stores.ROS2_HUMBLE)}
 
@@ -167,6 +172,9 @@ def write_bag(folder: Path, kind: str, entries: Iterable[tuple[str, float, Any]]
         mode = {"mcap-zstd": "STORAGE", "sqlite3-zstd-message": "MESSAGE", "sqlite3-zstd-file": "FILE"}[kind]
         writer2.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
     with writer2:
+        if kind == "mcap-lz4":
+            # rosbags reads such chunks and does not write them; its writer takes any compressor.
+            writer2.storage.compression, writer2.storage.compressor = "lz4", lz4_compress
         _fill(writer2, _STORES[False], ordered, lambda message, name: _STORES[False].serialize_cdr(message, name))
     return path
 

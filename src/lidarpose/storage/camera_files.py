@@ -12,7 +12,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.camera import Camera, DistortionModel
 from lidarpose.storage.camera_info import read_camera_info
-from lidarpose.storage.documents import read_opencv_xml, read_text, read_yaml
+from lidarpose.storage.documents import MAX_XML_BYTES, read_opencv_xml, read_text, read_yaml, shown
 
 _KINDS = "a ROS camera_info, OpenCV (camera_matrix, distortion_coefficients) or Kalibr camchain file"
 # The names that OpenCV's own calibration programs, and those made after them, write.
@@ -39,7 +39,7 @@ def read_camera(path: Path) -> Camera:
         holds several cameras.
     """
     path = Path(path)
-    text = read_text(path, _KINDS).lstrip()
+    text = read_text(path, _KINDS, MAX_XML_BYTES).lstrip()
     if text.startswith("<"):
         return _opencv(path, read_opencv_xml(path))
     document = read_yaml(path)
@@ -90,7 +90,7 @@ def _image_size(path: Path, keys: Mapping[str, Any]) -> tuple[int, int]:
         height = next((keys[name] for name in _HEIGHT if name in keys), None)
     for name, value in (("image_width", width), ("image_height", height)):
         if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 65535:
-            found = "is missing" if value is None else f"is {value!r}"
+            found = "is missing" if value is None else f"is {shown(value)}"
             raise InputError(
                 path, found, field=name, expected="the image's size in pixels, image_width and image_height"
             )
@@ -135,11 +135,11 @@ def _kalibr(path: Path, document: Mapping[str, Any]) -> Camera:
     name, entry = next(iter(cameras.items()))
     model = entry.get("camera_model", "pinhole")
     if model != "pinhole":
-        raise InputError(path, f"is {model!r}", field=f"{name}.camera_model", expected="pinhole")
+        raise InputError(path, f"is {shown(model)}", field=f"{name}.camera_model", expected="pinhole")
     distortion = entry.get("distortion_model", "none")
     if not isinstance(distortion, str) or distortion not in _KALIBR_MODELS:
         expected = " or ".join(_KALIBR_MODELS)
-        raise InputError(path, f"is {distortion!r}", field=f"{name}.distortion_model", expected=expected)
+        raise InputError(path, f"is {shown(distortion)}", field=f"{name}.distortion_model", expected=expected)
     intrinsics = _numbers(path, f"{name}.intrinsics", entry["intrinsics"])
     if len(intrinsics) != 4:
         raise InputError(path, f"holds {len(intrinsics)} numbers", field=f"{name}.intrinsics", expected="fu fv pu pv")

@@ -10,7 +10,7 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.model.camera import COEFFICIENT_COUNTS, Camera
 from lidarpose.storage.atomic import write_text
-from lidarpose.storage.documents import read_yaml
+from lidarpose.storage.documents import read_yaml, shown
 
 _MESSAGE_KEYS = {"width": "image_width", "height": "image_height", "k": "camera_matrix", "d": "distortion_coefficients"}
 
@@ -34,7 +34,7 @@ def read_camera_info(path: Path) -> Camera:
     if model in ("fisheye", "kannala_brandt"):
         model = "equidistant"
     if not isinstance(model, str) or model not in COEFFICIENT_COUNTS:
-        raise InputError(path, f"is {model!r}", field="distortion_model", expected=" or ".join(COEFFICIENT_COUNTS))
+        raise InputError(path, f"is {shown(model)}", field="distortion_model", expected=" or ".join(COEFFICIENT_COUNTS))
     distortion = _numbers(path, keys, "distortion_coefficients", COEFFICIENT_COUNTS[model])
     try:
         return Camera(
@@ -77,14 +77,14 @@ def _numbers(path: Path, keys: dict[str, Any], key: str, counts: tuple[int, ...]
     for entry in value:
         # The comparison fails for NaN, infinity, and whole numbers too large for a float.
         if isinstance(entry, bool) or not isinstance(entry, int | float) or not abs(entry) < 1e300:
-            raise InputError(path, f"holds {entry!r}", field=key, expected=expected)
+            raise InputError(path, f"holds {shown(entry)}", field=key, expected=expected)
     return [float(entry) for entry in value]
 
 
 def _size(path: Path, keys: dict[str, Any], key: str) -> int:
     value = keys.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 65535:
-        raise InputError(path, f"is {value!r}", field=key, expected="the image's size in pixels")
+        raise InputError(path, f"is {shown(value)}", field=key, expected="the image's size in pixels")
     return value
 
 

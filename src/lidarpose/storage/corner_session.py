@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -18,7 +18,8 @@ from lidarpose.model.cloud import Cloud
 from lidarpose.model.corner_session import CornerPlace, CornerSession
 from lidarpose.storage.atomic import replacing_folder, restore_folder, write_text
 from lidarpose.storage.calibration import read_calibration
-from lidarpose.storage.documents import Schema, check_format, parse, read_toml
+from lidarpose.storage.documents import Schema, check_format, parse, read_toml, shown
+from lidarpose.storage.limits import find_files
 from lidarpose.storage.provenance import provenance
 from lidarpose.storage.session import LidarSection, inside
 from lidarpose.storage.session_folder import check_free
@@ -127,15 +128,15 @@ def _near(table: TextTable, row: int) -> FloatArray | None:
 
 
 def _find_clouds(folder: Path, file: Path, line: int, pattern: str) -> Iterator[FileCloud]:
-    relative = PurePosixPath(pattern)
-    if relative.is_absolute() or ".." in relative.parts:
-        problem = f"line {line} has {pattern!r}"
-        raise InputError(file, problem, field="clouds", expected="a pattern inside the session's folder")
-    found = sorted(p for p in folder.glob(str(relative)) if p.is_file() and not p.name.startswith("."))
+    found = find_files(folder, pattern)
+    if found is None:
+        expected = "a pattern inside the session's folder, such as clouds/p00/*.pcd"
+        raise InputError(file, f"line {line} has {shown(pattern)}", field="clouds", expected=expected)
+    found = [path for path in found if not path.name.startswith(".")]
     if not found:
         raise InputError(
             file,
-            f"line {line}: no file matches {pattern!r}",
+            f"line {line}: no file matches {shown(pattern)}",
             field="clouds",
             expected="at least one cloud (" + " ".join(CLOUD_SUFFIXES) + ")",
         )

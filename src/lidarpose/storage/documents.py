@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import reprlib
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -12,9 +14,13 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from lidarpose.errors import InputError
 
-MAX_DOCUMENT_BYTES = 16 * 2**20
+MAX_DOCUMENT_BYTES = 8 * 2**20
+"""Of JSON, which may list the files of a session; its parser takes 50 times as much memory at worst."""
 MAX_YAML_BYTES = 2**16
 """Camera files have a few kB. The parser needs up to 2 s for 64 kB of the worst that can be written in YAML."""
+MAX_TOML_BYTES = 2**16
+MAX_XML_BYTES = 2**18
+_MAX_DOTS = 256
 
 
 class Schema(BaseModel):
@@ -26,14 +32,14 @@ class Schema(BaseModel):
 S = TypeVar("S", bound=BaseModel)
 
 
-def read_text(path: Path, what: str) -> str:
-    """The text of a small UTF-8 file. Raises InputError if it is missing, too large, or not text."""
+def read_text(path: Path, what: str, limit: int = MAX_DOCUMENT_BYTES) -> str:
+    """The text of a small UTF-8 file. Raises InputError if it is missing, larger than `limit` bytes, or not text."""
     try:
         if not path.is_file():
             problem = "is missing" if not path.exists() else "is not a regular file"
             raise InputError(path, problem, expected=what)
-        if path.stat().st_size > MAX_DOCUMENT_BYTES:
-            raise InputError(path, f"is larger than {MAX_DOCUMENT_BYTES // 2**20} MB", expected=what)
+        if path.stat().st_size > limit:
+            raise InputError(path, f"is larger than {limit // 2**10} kB", expected=what)
         return path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(path, f"byte {error.start} is not UTF-8 text", expected=what) from error
@@ -43,9 +49,13 @@ def read_text(path: Path, what: str) -> str:
 
 def read_toml(path: Path) -> dict[str, Any]:
     """A TOML document."""
+    text = read_text(path, "a TOML file", MAX_TOML_BYTES)
+    # The parser remembers every beginning of a dotted key, which is the square of its length.
+    if max(part.count(".") for part in re.split(r"[=\n\[\],{}]", text)) > _MAX_DOTS:
+        raise InputError(path, f"has a key of more than {_MAX_DOTS} parts", expected="a TOML file")
     try:
-        return tomllib.loads(read_text(path, "a TOML file"))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
         raise InputError(path, f"is not valid TOML: {error}") from error
 
 
@@ -54,14 +64,12 @@ def read_yaml(path: Path) -> Any:
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
-    text = read_text(path, "a YAML file")
-    if len(text) > MAX_YAML_BYTES:
-        raise InputError(path, f"is larger than {MAX_YAML_BYTES // 2**10} kB", expected="a camera's YAML file")
+    text = read_text(path, "a camera's YAML file", MAX_YAML_BYTES)
     if text.startswith("%YAML:"):
         # OpenCV writes "%YAML:1.0", which no YAML parser takes for a directive.
         text = text.partition("\n")[2]
     yaml = YAML(typ="safe", pure=True)
-    yaml.Constructor = _yaml_constructor()
+    yaml.Constructor, yaml.Composer = _yaml_constructor(), _yaml_composer()
     try:
         return yaml.load(text)
     except (YAMLError, ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
@@ -83,6 +91,21 @@ def _yaml_constructor() -> Any:
     return Constructor
 
 
+@cache
+def _yaml_composer() -> Any:
+    """ruamel's composer without aliases: a few lines of them stand for more than any memory holds."""
+    from ruamel.yaml.composer import Composer
+    from ruamel.yaml.events import AliasEvent
+
+    class Plain(Composer):  # type: ignore[misc, unused-ignore]
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.parser.check_event(AliasEvent):
+                raise ValueError("it has an alias, which files of cameras do not need")
+            return super().compose_node(parent, index)
+
+    return Plain
+
+
 def read_opencv_xml(path: Path) -> dict[str, Any]:
     """OpenCV's FileStorage as XML: matrices as mappings with rows, cols and data, else numbers or text.
 
@@ -90,7 +113,7 @@ def read_opencv_xml(path: Path) -> dict[str, Any]:
     """
     from xml.etree import ElementTree
 
-    text = read_text(path, "an OpenCV XML file")
+    text = read_text(path, "an OpenCV XML file", MAX_XML_BYTES)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise InputError(path, "has a document type", expected="plain XML without <!DOCTYPE and <!ENTITY")
     try:
@@ -147,7 +170,7 @@ def check_format(path: Path, document: Any, expected: str) -> dict[str, Any]:
         raise InputError(path, "holds no keys", expected=f'format = "{expected}"')
     found = document.get("format")
     if found != expected:
-        problem = "is missing" if found is None else f"is {found!r}"
+        problem = "is missing" if found is None else f"is {shown(found)}"
         name, _, version = expected.partition("@")
         newer = isinstance(found, str) and found.startswith(name + "@")
         remedy = f"This version of lidarpose reads {name} version {version} only." if newer else None
@@ -162,11 +185,12 @@ def parse(path: Path, schema: type[S], document: Any) -> S:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         field = ".".join(str(part) for part in first["loc"]) or "the document"
-        found = "" if first["type"] in ("missing", "extra_forbidden") else f", found {_shown(first['input'])}"
+        found = "" if first["type"] in ("missing", "extra_forbidden") else f", found {shown(first['input'])}"
         message = {"missing": "is missing", "extra_forbidden": "is not a known key"}.get(first["type"], first["msg"])
         raise InputError(path, f"{message}{found}", field=field) from None
 
 
-def _shown(value: Any) -> str:
-    text = repr(value)
+def shown(value: Any) -> str:
+    """A value as messages show it: not longer than a line, whatever it holds."""
+    text = reprlib.repr(value) if not isinstance(value, str) else repr(value[:100])
     return text if len(text) <= 60 else text[:57] + "..."

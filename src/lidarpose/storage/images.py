@@ -10,9 +10,9 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.model.image import GrayImage
+from lidarpose.storage.limits import file_size
 
-MAX_IMAGE_BYTES = 512 * 2**20
-MAX_PIXELS = 2**26
+MAX_PIXELS = 2**27
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -43,10 +43,14 @@ class FileImage:
         InputError
             If the file is missing, cut off, no image, or of another size than the camera's.
         """
-        data = _read_bytes(self.path)
+        # Raw 16-bit colour with transparency takes eight bytes a pixel; nothing of the camera's takes more.
+        data = _read_bytes(self.path, 9 * self.width * self.height + 2**20)
         size = png_size(self.path, data) if data.startswith(_PNG) else other_size(data)
-        if size is not None:
-            self._check_size(*size)
+        if size is None:
+            raise InputError(self.path, "is of no known kind", expected="a PNG, BMP, TIFF or JPEG image")
+        self._check_size(*size)
+        if size[0] * size[1] > MAX_PIXELS:
+            raise InputError(self.path, f"has {size[0]} x {size[1]} pixels", expected=f"at most {MAX_PIXELS} in all")
         image = _decode(self.path, data)
         self._check_size(image.shape[1], image.shape[0])
         return image
@@ -72,14 +76,17 @@ def decode_image(path: Path, data: bytes, *, where: str | None = None) -> GrayIm
     size = png_size(path, data) if data.startswith(_PNG) else other_size(data)
     if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
         found = "is of no known kind" if size is None else f"has {size[0]} x {size[1]} pixels"
-        raise InputError(path, f"an image {found}", field=where, expected="PNG, JPEG or BMP of at most 2^26 pixels")
+        raise InputError(
+            path, f"an image {found}", field=where, expected=f"PNG, JPEG, TIFF or BMP of at most {MAX_PIXELS} pixels"
+        )
     return _decode(path, data)
 
 
-def _read_bytes(path: Path) -> bytes:
+def _read_bytes(path: Path, limit: int) -> bytes:
+    size = file_size(path)
+    if size > limit:
+        raise InputError(path, f"is {size / 2**20:.1f} MB large", expected="an image of the camera's size")
     try:
-        if path.stat().st_size > MAX_IMAGE_BYTES:
-            raise InputError(path, f"is larger than {MAX_IMAGE_BYTES // 2**20} MB", expected="an image")
         return path.read_bytes()
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror or error}", expected="an image") from error
@@ -119,7 +126,9 @@ def _fast_png(data: bytes) -> GrayImage | None:
     width, height = struct.unpack_from(">II", data, len(_PNG) + 8)
     try:
         return np.asarray(decode_image_png_u8(data, (height, width), "mono"), np.uint8)[..., 0]
-    except Exception:
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException:  # a panic of the library, on damage or for want of memory, is no Exception
         return None
 
 
@@ -136,13 +145,28 @@ def png_size(path: Path, data: bytes) -> tuple[int, int]:
 
 
 def other_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height from the header of a BMP or JPEG, before anything is decoded; None for other formats."""
+    """Width and height from the header of a BMP, JPEG or TIFF, before anything is decoded; None for other formats."""
     if data[:2] == b"BM" and len(data) >= 26:
         width, height = struct.unpack_from("<ii", data, 18)
         return abs(width), abs(height)
     if data[:2] == b"\xff\xd8":
         return _jpeg_size(data)
+    if data[:4] in (b"II*\0", b"MM\0*") and len(data) >= 8:
+        return _tiff_size(data, "<" if data[:2] == b"II" else ">")
     return None
+
+
+def _tiff_size(data: bytes, order: str) -> tuple[int, int] | None:
+    """Width and height from a TIFF's first directory; None if they are not there as numbers."""
+    start = int(struct.unpack_from(f"{order}I", data, 4)[0])
+    found: dict[int, int] = {}
+    if start + 2 <= len(data):
+        count = int(struct.unpack_from(f"{order}H", data, start)[0])
+        for at in range(start + 2, min(start + 2 + 12 * count, len(data) - 11), 12):
+            tag, kind = struct.unpack_from(f"{order}HH", data, at)
+            if tag in (256, 257) and kind in (3, 4):
+                found.setdefault(tag, int(struct.unpack_from(order + ("H" if kind == 3 else "I"), data, at + 8)[0]))
+    return (found[256], found[257]) if len(found) == 2 else None
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:

@@ -8,7 +8,7 @@ reach from the bytes that are there.
 from __future__ import annotations
 
 import stat
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from lidarpose.errors import InputError
 
@@ -34,6 +34,29 @@ def file_size(path: Path) -> int:
     if not stat.S_ISREG(status.st_mode):
         raise InputError(path, "is not a regular file", expected="a file, not a folder, pipe or device")
     return status.st_size
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; a name that no file can have is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def find_files(folder: Path, pattern: str) -> list[Path] | None:
+    """The files of a folder that match a pattern, sorted; None if the pattern leads out of the folder or is none.
+
+    `**` stands for folders of any depth, alone and once.
+    """
+    relative = PurePosixPath(pattern)
+    parts = relative.parts
+    deep = [part for part in parts if "**" in part]
+    if relative.is_absolute() or not parts or ".." in parts or len(parts) > 32 or "\0" in pattern:
+        return None
+    if deep not in ([], ["**"]) or max(len(part.encode()) for part in parts) > 255:
+        return None
+    return sorted(path for path in folder.glob(str(relative)) if is_file(path))
 
 
 def require_count(path: Path, field: str, count: int, limit: int = MAX_POINTS) -> int:

@@ -180,7 +180,10 @@ def _map_array(path: Path, *, required: bool) -> RealArray | None:
         raise InputError(path, f"holds {dtype}", expected="real numbers (float32, float64 or integers)")
     if 0 in shape:
         return np.zeros(shape, dtype=dtype)
-    return np.memmap(path, dtype=dtype, mode="r", offset=start, shape=shape, order="F" if fortran else "C")
+    try:
+        return np.memmap(path, dtype=dtype, mode="r", offset=start, shape=shape, order="F" if fortran else "C")
+    except (OSError, ValueError, OverflowError) as error:
+        raise InputError(path, f"cannot be mapped into memory: {error}", expected="an array of usual size") from error
 
 
 def _product(shape: tuple[int, ...]) -> int:

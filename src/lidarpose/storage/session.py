@@ -22,8 +22,9 @@ from lidarpose.model.scan import LidarSpec, Scan
 from lidarpose.model.session import DEFAULT_PLACEMENT, TurntablePlace, TurntableSession
 from lidarpose.model.targets import Panel
 from lidarpose.storage.camera_files import read_camera
-from lidarpose.storage.documents import Schema, check_format, parse, read_toml
+from lidarpose.storage.documents import Schema, check_format, parse, read_toml, shown
 from lidarpose.storage.images import FileImage
+from lidarpose.storage.limits import find_files, is_file
 from lidarpose.storage.tables import TextTable, read_number_table, read_text_table
 
 SESSION_FORMAT = "lidarpose/turntable-session@1"
@@ -146,14 +147,14 @@ def inside(folder: Path, name: str, file: Path, field: str) -> Path:
     """The path of a file that a session names, which must lie in the session's folder and be there."""
     relative = PurePosixPath(name.strip())
     if not name.strip() or relative.is_absolute() or ".." in relative.parts:
-        raise InputError(file, f"is {name!r}", field=field, expected="the path of a file inside the session's folder")
+        raise InputError(file, f"is {shown(name)}", field=field, expected="a path inside the session's folder")
     path = folder / relative
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(
             file,
-            f"names {name!r}, which is missing",
+            f"names {shown(name)}, which is missing",
             field=field,
-            expected=f"a file {path}",
+            expected=f"a file of the folder {folder}",
             remedy="Put the file in its place, or take its row out.",
         )
     return path
@@ -164,18 +165,17 @@ def _find_board_images(
 ) -> Mapping[str, tuple[ImageSource, ...]]:
     """By placement; where the board was moved, each placement's shots lie in a sub-folder of its name."""
     relative = PurePosixPath(pattern)
-    if not pattern.strip() or relative.is_absolute() or ".." in relative.parts:
-        raise InputError(
-            file, f"is {pattern!r}", field="board.images", expected="a pattern inside the session's folder"
-        )
     found: dict[str, tuple[ImageSource, ...]] = {}
     for placement in sorted(placements):
         here = relative if placement == DEFAULT_PLACEMENT else relative.parent / placement / relative.name
-        paths = sorted(p for p in folder.glob(str(here)) if p.is_file())
+        paths = find_files(folder, str(here))
+        if paths is None:
+            expected = "a pattern inside the session's folder, such as board/*.png"
+            raise InputError(file, f"is {shown(pattern)}", field="board.images", expected=expected)
         if not paths:
             raise InputError(
                 file,
-                f"no image matches {str(here)!r}",
+                f"no image matches {shown(str(here))}",
                 field="board.images",
                 expected="at least one image of the board in bright light",
             )
@@ -207,13 +207,13 @@ def _check_files(folder: Path, table: TextTable) -> None:
         for column in ("stripe_image", "scan")
         if cells[column]
     ]
-    missing = [entry for entry in named if not (folder / entry[2]).is_file()]
+    missing = [entry for entry in named if not is_file(folder / entry[2])]
     if len(missing) > 1:
-        shown = ", ".join(f"{name} (line {line})" for line, _, name in missing[:5])
+        listed = ", ".join(f"{name[:60]} (line {line})" for line, _, name in missing[:5])
         more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
         raise InputError(
             table.path,
-            f"{len(missing)} of {len(named)} files are missing: {shown}{more}",
+            f"{len(missing)} of {len(named)} files are missing: {listed}{more}",
             field="/".join(dict.fromkeys(column for _, column, _ in missing)),
             expected="every file named to be in the session's folder",
             remedy="Put the files in their places, or take their rows out.",
@@ -228,10 +228,10 @@ def _place(folder: Path, table: TextTable, row: int, angle_rad: float, camera: C
         image = FileImage(path, cells["stripe_image"], camera.width, camera.height)
     scan = FileScan(inside(folder, cells["scan"], table.path, f"line {line}: scan"), cells["scan"])
     placement = cells.get("placement", DEFAULT_PLACEMENT)
-    if "placement" in table.columns and (not placement or "/" in placement or placement.startswith(".")):
+    if "placement" in table.columns and (not placement or set(placement) & set("/*?[") or placement.startswith(".")):
         raise InputError(
             table.path,
-            f"line {line} has {placement!r}",
+            f"line {line} has {shown(placement)}",
             field="placement",
             expected="the name of the board images' sub-folder",
         )

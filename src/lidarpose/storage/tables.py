@@ -14,9 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.storage.documents import shown
 
-MAX_TABLE_BYTES = 256 * 2**20
+MAX_TABLE_BYTES = 32 * 2**20
+"""Of numbers: a million beams and a half."""
+MAX_TEXT_TABLE_BYTES = 4 * 2**20
+_MAX_LINE_BYTES = 2**16
+_BLOCK = 2**20
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,7 @@ class TextTable:
         # float() also takes "nan", "infinity" and "1_000": none of them is a number in a table.
         if not np.isfinite(value) or "_" in text:
             raise InputError(
-                self.path, f"line {self.lines[row]} has {text!r}", field=column, expected="a finite number"
+                self.path, f"line {self.lines[row]} has {shown(text)}", field=column, expected="a finite number"
             )
         return value
 
@@ -51,7 +56,7 @@ def read_text_table(path: Path, required: Sequence[str], optional: Sequence[str]
     InputError
         If it is missing, not UTF-8, lacks a required column, has one that is not known, or a row of another length.
     """
-    records = list(_records(path, _read_text(path)))
+    records = list(_records(path, _read_text(path, MAX_TEXT_TABLE_BYTES)))
     columns = _check_header(path, records[0] if records else [], required, optional)
     rows, lines = [], []
     for number, record in enumerate(records[1:], start=2):
@@ -74,16 +79,28 @@ def read_number_table(
     InputError
         As `read_text_table`, and for a cell that is no finite number or is empty where it must not be.
     """
-    text = _read_text(path)
-    header, _, body = text.partition("\n")
-    columns = _check_header(path, next(_records(path, header), []), required, optional)
-    if not body.strip():
-        return {name: np.zeros(0) for name in columns}
-    table = _parse_numbers(body, len(columns))
+    text = _read_text(path, MAX_TABLE_BYTES)
+    first, _, _ = text.partition("\n")
+    columns = _check_header(path, next(_records(path, first), []), required, optional)
     gaps_allowed = np.array([name in may_be_empty for name in columns])
-    if table is None or np.isinf(table).any() or np.isnan(table[:, ~gaps_allowed]).any() or "nan" in body.lower():
-        table = _parse_slowly(path, body, columns, gaps_allowed)
+    line, start = 2, len(first) + 1
+    tables: list[FloatArray] = [np.zeros((0, len(columns)))]
+    while start < len(text):
+        # Blocks of whole lines: what is odd is found in its block, and little memory is needed at a time.
+        end = text.find("\n", start + _BLOCK) + 1 or len(text)
+        block = text[start:end]
+        if block.strip():
+            tables.append(_parse_block(path, block, line, columns, gaps_allowed))
+        line, start = line + block.count("\n"), end
+    table = np.concatenate(tables)
     return {name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(columns)}
+
+
+def _parse_block(path: Path, body: str, line: int, columns: tuple[str, ...], gaps_allowed: BoolArray) -> FloatArray:
+    table = _parse_numbers(body, len(columns))
+    if table is None or np.isinf(table).any() or np.isnan(table[:, ~gaps_allowed]).any() or "nan" in body.lower():
+        table = _parse_slowly(path, body, line, columns, gaps_allowed)
+    return table
 
 
 def _records(path: Path, text: str) -> Iterator[list[str]]:
@@ -108,9 +125,9 @@ def _parse_numbers(body: str, width: int) -> FloatArray | None:
     return table if table.shape[1] == width else None
 
 
-def _parse_slowly(path: Path, body: str, columns: tuple[str, ...], gaps_allowed: FloatArray) -> FloatArray:
+def _parse_slowly(path: Path, body: str, line: int, columns: tuple[str, ...], gaps_allowed: BoolArray) -> FloatArray:
     rows = []
-    for number, record in enumerate(_records(path, body), start=2):
+    for number, record in enumerate(_records(path, body), start=line):
         if not any(cell.strip() for cell in record):
             continue
         if len(record) != len(columns):
@@ -129,17 +146,19 @@ def _number(path: Path, line: int, column: str, text: str, may_be_empty: bool) -
         value = float("nan")
     if not np.isfinite(value) or "_" in text:
         expected = "a finite number" + (", or nothing at all" if may_be_empty else "")
-        raise InputError(path, f"line {line} has {text!r}", field=column, expected=expected)
+        raise InputError(path, f"line {line} has {shown(text)}", field=column, expected=expected)
     return value
 
 
-def _read_text(path: Path) -> str:
+def _read_text(path: Path, limit: int) -> str:
     try:
         if not path.is_file():
             raise InputError(path, "is missing" if not path.exists() else "is not a file", expected="a CSV table")
-        if path.stat().st_size > MAX_TABLE_BYTES:
-            raise InputError(path, f"is larger than {MAX_TABLE_BYTES // 2**20} MB", expected="a CSV table")
-        text = path.read_bytes().decode("utf-8-sig")
+        if path.stat().st_size > limit:
+            raise InputError(path, f"is larger than {limit // 2**20} MB", expected="a CSV table")
+        data = path.read_bytes()
+        _check_lines(path, data)
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(path, f"byte {error.start} is not UTF-8 text", expected="a CSV table in UTF-8") from error
     except OSError as error:
@@ -149,6 +168,17 @@ def _read_text(path: Path) -> str:
     if "\0" in text:
         raise InputError(path, "holds zero bytes", expected="a CSV table in UTF-8")
     return text
+
+
+def _check_lines(path: Path, data: bytes) -> None:
+    """InputError if a line is longer than any row."""
+    start = 0
+    while len(data) - start > _MAX_LINE_BYTES:
+        end = data.rfind(b"\n", start, start + _MAX_LINE_BYTES)
+        if end < 0:
+            line = data.count(b"\n", 0, start) + 1
+            raise InputError(path, "is too long", field=f"line {line}", expected="a row of a CSV table")
+        start = end + 1
 
 
 def _check_header(
@@ -163,7 +193,7 @@ def _check_header(
             raise InputError(path, f"the column {name} is missing", field="line 1", expected=f"the header {wanted}")
     for name in columns:
         if name not in required and name not in optional:
-            raise InputError(path, f"unknown column {name!r}", field="line 1", expected=f"the header {wanted}")
+            raise InputError(path, f"unknown column {shown(name)}", field="line 1", expected=f"the header {wanted}")
     if len(set(columns)) != len(columns):
         raise InputError(path, "a column stands twice", field="line 1", expected=f"the header {wanted}")
     return columns
