@@ -24,6 +24,9 @@ def test_a_session_becomes_a_calibration(
     assert document["table_1"]["centre_mm"]["mean"] < 1.12
     assert document["table_1"]["z_deg"]["mean"] < 0.203
     assert document["table_1"]["x_deg"]["mean"] < 0.662
+    if method == "joint":
+        assert 0.0 < document["axis_sigma"]["radius_mm"] < 1.0
+        assert 0.0 < document["axis_sigma"]["tilt_deg"] < 0.1
     assert document["error_against_truth"]["arc"]["centre_mm"]["largest"] < 1.0
     assert document["error_against_truth"]["arc"]["rotation_deg"]["largest"] < 0.1
     calibration = read_turntable_calibration(tmp_path / "calibration.json")

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 def summary(run: TurntableRun, error: TruthError | None) -> dict[str, Any]:
     """The result as a JSON object; units in the keys."""
     quality = run.calibration.quality
+    axis = run.calibration.axis_sigma()
     document: dict[str, Any] = {
         "kind": "turntable",
         "method": run.method,
@@ -27,6 +28,8 @@ def summary(run: TurntableRun, error: TruthError | None) -> dict[str, Any]:
         "reasons": [] if quality is None else list(quality.reasons),
         "places": {"recorded": len(run.session.places), "used": places_used(run)},
         "radius_mm": 1e3 * run.calibration.motion.radius_m,
+        "axis_direction_camera": run.calibration.motion.axis_direction_camera.tolist(),
+        "axis_sigma": None if axis is None else {"radius_mm": 1e3 * axis[0], "tilt_deg": float(np.rad2deg(axis[1]))},
         "table_1": None if run.deviation is None else _table_1(run.deviation),
         "sigma": [
             {"angle_deg": angle, "centre_mm": centre, "rotation_deg": rotation}
@@ -103,6 +106,14 @@ def _print_sigmas(console: Console, run: TurntableRun) -> None:
     ]
     if rows:
         console.print(figures_table("Standard deviations", ("reading / deg", "centre / mm", "rotation / deg"), rows))
+    axis, motion = run.calibration.axis_sigma(), run.calibration.motion
+    if axis is not None:
+        x, y, z = motion.axis_direction_camera
+        console.print(
+            f"axis in the camera frame ({x:+.5f}, {y:+.5f}, {z:+.5f}), tilt known to {np.rad2deg(axis[1]):.4f} deg; "
+            f"radius {1e3 * motion.radius_m:.3f} mm, known to {1e3 * axis[0]:.3f} mm",
+            soft_wrap=True,
+        )
 
 
 def _print_truth(console: Console, error: TruthError) -> None:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from lidarpose.geometry.arrays import FloatArray
-from lidarpose.geometry.se3 import Pose, UncertainPose
+from lidarpose.geometry.se3 import Pose, UncertainPose, skew
 from lidarpose.model.turntable import PARAMETER_NAMES, TurntableMotion
 
 Verdict = Literal["good", "doubtful", "rejected"]
@@ -71,6 +71,14 @@ class TurntableCalibration:
         if self.parameter_covariance is None:
             return None
         return uncertain_pose_at(self.motion, self.parameter_names, self.parameter_covariance, turntable_angle_rad)
+
+    def axis_sigma(self) -> tuple[float, float] | None:
+        """Standard deviations of the radius (m) and of the axis' direction in the camera frame (rad), both tilts."""
+        C = self.motion_covariance
+        if C is None:
+            return None
+        across = skew(self.motion.axis_direction_camera)
+        return float(np.sqrt(C[6, 6])), float(np.sqrt(np.trace(across @ C[3:6, 3:6] @ across.T)))
 
     def transform_covariances(self) -> tuple[FloatArray, FloatArray] | None:
         """The 6x6 covariances of ``T_camera_turntable`` and ``T_turntable_lidar``, each by itself."""

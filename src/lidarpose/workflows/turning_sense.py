@@ -41,10 +41,9 @@ def turning_sense(motion: TurntableMotion, turntable_angle_rad: float) -> str:
     beams = _plainest(_beam_axis(motion, turntable_angle_rad))
     table = _plainest(motion.axis_direction_camera)
     return (
-        f"As the files have it, growing beam angles turn {_said(beams)}, and growing readings turn {_said(table)}. "
-        "Compare this with the rig: data alone cannot tell a scan that is written in reverse from a LiDAR mounted "
-        "upside down, nor negated readings from an axis that points the other way. "
-        f"To have it checked: --beams-turn {beams} --table-turns {table} if you see it so, the other sense if not."
+        f"By the files growing beam angles turn {_said(beams)}, and growing readings turn {_said(table)}. Look whether "
+        "your rig does: a scan in reverse, or negated readings, show in no residual. "
+        f"To have it checked, state what you see; this would be --beams-turn {beams} --table-turns {table}"
     )
 
 
