@@ -5,7 +5,7 @@ import pytest
 
 from lidarpose.detect.chessboard import find_panels
 from lidarpose.detect.laser_stripe import StripeFinder
-from lidarpose.detect.stripe_fit import _not_negative
+from lidarpose.detect.stripe_noise import not_negative
 from lidarpose.simulate.rig import draw_rig, paper_camera
 from lidarpose.simulate.session import SimulationOptions, simulate_session
 
@@ -191,5 +191,5 @@ def test_the_noise_model_never_has_a_negative_part() -> None:
         design = rng.random((8, 3)) * [1.0, 50.0, 1e4] / rng.random((8, 1))
         goal = rng.normal(size=8) + 1.0
         expected, _ = nnls(design, goal)
-        found = _not_negative(design[None], goal[None])[0]
+        found = not_negative(design[None], goal[None])[0]
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)

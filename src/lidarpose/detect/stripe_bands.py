@@ -1,0 +1,264 @@
+"""Narrow bands of pixels along the stripes of one panel, cut from several images at once, and curves through them.
+
+Tables of B bands, N profiles each and P pixels a profile. P comes first: NumPy is fast along the last axis, profiles
+are short. Several bands at once, because single ones are so small that calling NumPy would take most of the time.
+Shorter bands are filled up with profiles that are not `valid`, and nothing passes from one band to another. Single
+precision, where there is a number for each pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarpose.detect.stripe_search import CoarseLine, PanelView
+from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.robust import MAD_TO_SIGMA
+from lidarpose.model.image import GrayImage
+
+# Profiles of a band, about, that the width, the squares' colours and a first curve are found from.
+_FEW = 250
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """v as a polynomial of u, one a band, in (u - middle) / half: coefficients (B, K), middle and half (B, 1)."""
+
+    coefficients: FloatArray
+    middle: FloatArray
+    half: FloatArray
+
+    def at(self, u: FloatArray) -> FloatArray:
+        return _horner(self.coefficients, (u - self.middle) / self.half)
+
+    def slope(self, u: FloatArray) -> FloatArray:
+        derivative = self.coefficients[:, 1:] * np.arange(1, self.coefficients.shape[1]) / self.half
+        return _horner(derivative, (u - self.middle) / self.half)
+
+    def take(self, which: BoolArray) -> Curves:
+        return Curves(self.coefficients[which], self.middle[which], self.half[which])
+
+
+def _horner(coefficients: FloatArray, x: FloatArray) -> FloatArray:
+    value = np.broadcast_to(coefficients[:, -1:], x.shape)
+    for k in range(coefficients.shape[1] - 2, -1, -1):
+        value = value * x + coefficients[:, k : k + 1]
+    return np.asarray(value)
+
+
+@dataclass(frozen=True, eq=False)
+class Ranges:
+    """Profiles of each band: whole coordinates u (B, N) along the stripe, and which of them are any (B, N)."""
+
+    u: FloatArray
+    valid: BoolArray
+
+    def take(self, which: BoolArray) -> Ranges:
+        return Ranges(self.u[which], self.valid[which])
+
+    def thinned(self) -> Ranges:
+        """About `_FEW` profiles of each band, evenly spread."""
+        count = np.count_nonzero(self.valid, axis=1)
+        step = np.maximum(count // _FEW, 1)[:, None]
+        index = np.arange(int((count[:, None] / step).max()) + 1) * step
+        valid = index < count[:, None]
+        return Ranges(np.take_along_axis(self.u, np.where(valid, index, 0), axis=1), valid)
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Profiles along the stripes, as tables (P, B, N): what belongs to a profile, (B, N), combines with them as it is.
+
+    u, valid : (B, N); v : (P, B, N) pixel coordinates; values, bright : grey levels; good : pixels that count;
+    ambient : light that was taken out of the values; cosine, sine : (B, N) of the stripe's inclination;
+    light : share of light surface that each pixel sees.
+    """
+
+    u: FloatArray
+    valid: BoolArray
+    v: FloatArray
+    values: FloatArray
+    bright: FloatArray
+    good: FloatArray
+    ambient: FloatArray
+    cosine: FloatArray
+    sine: FloatArray
+    light: FloatArray
+
+    @property
+    def half(self) -> int:
+        return int(self.v.shape[0] // 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Where the pixels come from: a panel, images of it whose stripes run the same way, and the sensor's limit."""
+
+    view: PanelView
+    images: Sequence[GrayImage]
+    steep: bool
+    limit: float
+
+    def take(self, which: BoolArray) -> Source:
+        return replace(self, images=[image for image, taken in zip(self.images, which, strict=True) if taken])
+
+
+def usable_ranges(view: PanelView, lines: Sequence[CoarseLine], curves: Curves) -> Ranges:
+    """Whole u near the coarse lines' ranges whose centre lies in a usable square."""
+    steep = lines[0].steep
+    axis, across = (1, 0) if steep else (0, 1)
+    slack = 4 * view.factor
+    first = np.array([max(int(np.floor(line.start)) - slack, view.low[axis]) for line in lines])
+    last = np.array([min(int(np.ceil(line.end)) + slack, view.high[axis] - 1) for line in lines])
+    u = first[:, None] + np.arange(max(int((last - first).max()) + 1, 1), dtype=np.float64)
+    v = curves.at(u)
+    usable = (u <= last[:, None]) & (v > view.low[across] + 3) & (v < view.high[across] - 4)
+    at = np.nonzero(usable)
+    grid, _ = view.grid_and_slopes(as_pixels(u[at], v[at], steep))
+    usable[at] = view.albedo.is_usable(grid)
+    # Usable ones to the front of each row; what fills it up repeats the first.
+    count = usable.sum(axis=1)
+    order = np.argsort(~usable, axis=1, kind="stable")[:, : max(int(count.max()), 1)]
+    valid = np.arange(order.shape[1]) < count[:, None]
+    return Ranges(np.take_along_axis(u, np.where(valid, order, order[:, :1]), axis=1), valid)
+
+
+def as_pixels(u: FloatArray, v: FloatArray, steep: bool) -> FloatArray:
+    return np.stack([v, u] if steep else [u, v], axis=-1)
+
+
+def cut(source: Source, ranges: Ranges, curves: Curves, half: FloatArray) -> Bands:
+    """Profiles of 2 half + 1 pixels about the curves; `half` (B,) may differ from band to band."""
+    view, steep = source.view, source.steep
+    reach = int(half.max())
+    offsets = np.arange(-reach, reach + 1)[:, None, None]
+    v = np.rint(curves.at(ranges.u)).astype(np.intp) + offsets
+    across = 0 if steep else 1
+    safe = np.clip(v, view.low[across], view.high[across] - 1)
+    along = ranges.u.astype(np.intp)
+    rows, columns = (along, safe) if steep else (safe, along)
+    index = rows * source.images[0].shape[1] + columns
+    values = np.stack([image.take(index[:, b]) for b, image in enumerate(source.images)], axis=1)
+    bright = view.bright.take((rows - view.low[1]) * view.bright.shape[1] + (columns - view.low[0]))
+    within = ranges.valid & (np.abs(offsets) <= half[:, None])
+    good = ((v == safe) & (values < 0.98 * source.limit) & within).astype(np.float32)
+    slope = curves.slope(ranges.u)
+    cosine = 1.0 / np.sqrt(1.0 + slope**2)
+    values = values.astype(np.float32)
+    nothing = np.zeros_like(values)
+    return Bands(
+        ranges.u, ranges.valid, v.astype(np.float32), values, bright, good, nothing, cosine, slope * cosine, nothing
+    )
+
+
+def _half_heights(curves: Curves, ranges: Ranges, width: FloatArray) -> FloatArray:
+    """Half-heights (B,) of bands that hold the profile and enough of its surroundings."""
+    steepest = np.sqrt(1.0 + np.max(np.abs(curves.slope(ranges.u)), axis=1) ** 2)
+    return np.asarray(np.clip(np.ceil(3.3 * width * steepest + 1.5), 4, 24))
+
+
+def bands_about(source: Source, ranges: Ranges, curves: Curves, width: FloatArray) -> Bands:
+    """The bands about good curves, with the ambient light taken out and the first backgrounds."""
+    bands = cut(source, ranges, curves, _half_heights(curves, ranges, width))
+    flank = bands.good * (np.abs(distance_from(bands, curves.at(bands.u))) > for_table(2.7 * width))
+    ambient = _ambient(bands, flank, curves)
+    return replace(bands, values=bands.values - ambient, ambient=ambient)
+
+
+def distance_from(bands: Bands, centre: FloatArray) -> FloatArray:
+    """Distance (P, B, N) of the pixels from the stripe's centre line."""
+    return np.asarray((bands.v - for_table(centre)) * for_table(bands.cosine))
+
+
+def for_table(values: FloatArray) -> FloatArray:
+    """Values of profiles (B, N), or of bands (B,), in the precision of the tables (P, B, N) they are used with."""
+    single = np.asarray(values, dtype=np.float32)
+    return single if single.ndim == 2 else single[:, None]
+
+
+def fit_curves(bands: Bands, v: FloatArray, weight: FloatArray, degree: int, cubic: BoolArray | None = None) -> Curves:
+    """Weighted least squares; well conditioned in a coordinate from -1 to 1. Where not `cubic`, without the cube."""
+    u = bands.u
+    last = np.take_along_axis(u, np.maximum(bands.valid.sum(axis=1) - 1, 0)[:, None], axis=1)
+    middle, half = 0.5 * (u[:, :1] + last), np.maximum(0.5 * (last - u[:, :1]), 1.0)
+    s = (u - middle) / half
+    powers = [np.ones_like(s), s]
+    for _ in range(degree - 1):
+        powers.append(powers[-1] * s)
+    design = np.stack(powers, axis=1)
+    weighted = design * weight[:, None]
+    normal = weighted @ design.swapaxes(1, 2)
+    trace = np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-30)
+    normal += np.eye(degree + 1) * (1e-12 * trace)[:, None, None]
+    if cubic is not None:
+        normal[:, 3, 3] += np.where(cubic, 0.0, 1e9 * trace)
+    return Curves(np.linalg.solve(normal, weighted @ v[..., None])[..., 0], middle, half)
+
+
+def quantile(values: FloatArray, share: float) -> float:
+    """As numpy's, to the nearest value, without its checks."""
+    k = int(share * (len(values) - 1))
+    return float(np.partition(values, k)[k])
+
+
+def quantiles(values: FloatArray, which: BoolArray, share: float) -> FloatArray:
+    """The same (B,) for each row of `values` (B, N), of those in `which` (B, N); infinite where there are none."""
+    count = np.count_nonzero(which, axis=1)
+    k = (share * np.maximum(count - 1, 0)).astype(np.intp)
+    ordered = np.sort(np.where(which, values, np.inf), axis=1)
+    return np.asarray(np.take_along_axis(ordered, k[:, None], axis=1)[:, 0], dtype=np.float64)
+
+
+def spreads(values: FloatArray, which: BoolArray) -> FloatArray:
+    """Robust standard deviation about zero of each row; infinite where `which` has none."""
+    return MAD_TO_SIGMA * quantiles(np.abs(values), which, 0.5)
+
+
+def _ambient(bands: Bands, flank: FloatArray, curves: Curves) -> FloatArray:
+    """The bright image times a share that changes slowly along the stripe, from the pixels beside it (`flank`)."""
+    count = np.maximum(flank.sum(axis=0), 1.0)
+    values, bright = (flank * (x - (x * flank).sum(axis=0) / count) for x in (bands.values, bands.bright))
+    s = (bands.u - curves.middle) / curves.half
+    powers = np.stack([np.ones_like(s), s, s**2], axis=2)
+    own, cross = np.einsum("pbn,pbn->bn", bright, bright), np.einsum("pbn,pbn->bn", bright, values)
+    normal = (powers * own[..., None]).swapaxes(1, 2) @ powers
+    # Flat profiles tell nothing: a weak pull towards no ambient light.
+    normal += np.eye(3) * (1e-6 * np.trace(normal, axis1=1, axis2=2) + 1.0)[:, None, None]
+    share = np.linalg.solve(normal, powers.swapaxes(1, 2) @ cross[..., None].astype(np.float64))
+    return np.asarray(for_table((powers @ share)[..., 0]) * bands.bright)
+
+
+def look_at_albedo(bands: Bands, source: Source, curves: Curves, width: FloatArray) -> Bands:
+    """Share of light surface that each pixel sees through stripe and lens (see `laser_stripe`)."""
+    view, steep = source.view, source.steep
+    albedo = view.albedo
+    centre, slope = curves.at(bands.u), curves.slope(bands.u)
+    cosine = 1.0 / np.sqrt(1.0 + slope**2)
+    sine = slope * cosine
+    grid, slopes = view.grid_and_slopes(as_pixels(bands.u, centre, steep))
+    by_u, by_v = (slopes[..., 1::2], slopes[..., ::2]) if steep else (slopes[..., ::2], slopes[..., 1::2])
+    across = by_v * cosine[..., None] - by_u * sine[..., None]
+    along = by_u * cosine[..., None] + by_v * sine[..., None]
+    blur2 = np.minimum(albedo.blur_px, width) ** 2
+    thickness = (1.0 - blur2 / width**2)[:, None]
+    edges = np.sqrt(blur2[:, None, None] * (thickness[..., None] * across**2 + along**2))
+    # A pixel at (0, dv) from the centre is seen at dv along the stripe's tangent plus `thickness` of it across.
+    dv = bands.v - for_table(centre)
+    per_v = by_v * (cosine**2 * thickness + sine**2)[..., None]
+    per_v = per_v + by_u * ((1.0 - thickness) * cosine * sine)[..., None]
+    inside = _inside_squares(view, grid, across, width)
+    x, y = (dv * for_table(per_v[..., k]) + for_table(grid[..., k]) for k in (0, 1))
+    light = albedo.light_share(x, y, for_table(edges[..., 0]), for_table(edges[..., 1]))
+    return replace(bands, cosine=cosine, sine=sine, light=light, good=bands.good * inside)
+
+
+def _inside_squares(view: PanelView, grid: FloatArray, across: FloatArray, width: FloatArray) -> FloatArray:
+    """1 for profiles (B, N) whose light falls on usable squares alone: what lies around the board is not known.
+
+    `across` (B, N, 2) is the change of the grid coordinates by a pixel across the stripe.
+    """
+    usable = view.albedo.is_usable
+    reach = 2.5 * width[:, None, None] * across
+    return (usable(grid) & usable(grid - reach) & usable(grid + reach)).astype(np.float32)
