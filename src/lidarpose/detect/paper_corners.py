@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarpose.geometry.arrays import FloatArray
+from lidarpose.detect.trihedral_corner import FaceMask
+from lidarpose.geometry.arrays import FloatArray, perpendicular_pair, unit
 from lidarpose.geometry.planes import Plane, fit_plane, intersect_three_planes
+from lidarpose.geometry.robust import mad_sigma
 from lidarpose.model.corner_result import CornerCandidate
 
 # Section 3.1: "points farther than 0.01 m from the plane do not belong to it".
@@ -19,6 +21,13 @@ MIN_POINTS = 12
 SCREENING_RAD = np.radians(20.0)
 SCREENING_NEIGHBOURS = 24
 FACE_TILT_RAD = np.radians(5.0)
+# The fit along the beams: first gate in thresholds, Tukey's loss, and the slope at which a face is no longer seen.
+WIDE_GATE = 4.0
+TUKEY_K = 6.0
+ML_STEPS = 6
+INNER_SHARE = 0.93
+LINED_UP = 0.05
+LEAST_SLOPE = 0.05
 HARRIS_RADIUS_M = 0.1
 HARRIS_K = 0.04
 
@@ -61,6 +70,10 @@ def ransac_corner(points: FloatArray, sighting: CornerCandidate, *, seed: int, s
         planes = _apart(region, planes)
         if not _are_the_faces(planes, sighting):
             return None
+        fitted = _fitted_along_beams(points, planes, sighting)
+        if fitted is None:
+            return None
+        planes = fitted
     try:
         corner = intersect_three_planes((planes[0], planes[1], planes[2]))
     except ValueError:
@@ -79,6 +92,80 @@ def _apart(points: FloatArray, planes: list[Plane]) -> list[Plane]:
             fitted.append(_refitted(points[chosen], plane))
         planes = fitted
     return planes
+
+
+def _fitted_along_beams(points: FloatArray, planes: list[Plane], sighting: CornerCandidate) -> list[Plane] | None:
+    """The planes fitted to all beams that meet their faces, off the edges, told by the beams' directions alone.
+
+    None where a face's beams lie along one scan line: they determine no plane.
+    """
+    range_m = np.linalg.norm(points, axis=1)
+    directions = points / range_m[:, None]
+    cosine = np.stack([p.normal for p in planes]) @ sighting.normals.T
+    order = [int(np.argmax(np.abs(cosine[:, j]))) for j in range(3)]
+    faces = [planes[k] if cosine[k, j] > 0.0 else planes[k].flipped() for j, k in enumerate(order)]
+    margin_m = 0.005 + 0.0015 * float(np.linalg.norm(sighting.corner))
+    for _ in range(2):
+        try:
+            corner = intersect_three_planes((faces[0], faces[1], faces[2]))
+        except ValueError:
+            return None
+        a, b, c = (corner + INNER_SHARE * (o - sighting.corner) for o in sighting.outlines)
+        normals = np.stack([face.normal for face in faces])
+        mask = FaceMask(corner, normals, sighting.convex, (a, b, c), sighting.obstacles, margin_m)
+        index, met = mask.select(directions, range_m, WIDE_GATE * THRESHOLD_M)
+        beams = [index[met == j] for j in range(3)]
+        if not all(_spread_both_ways(directions[b]) for b in beams):
+            return None
+        faces = [_along_beams(directions[b], range_m[b], f) for b, f in zip(beams, faces, strict=True)]
+    return faces
+
+
+def _spread_both_ways(directions: FloatArray) -> bool:
+    if len(directions) < MIN_POINTS:
+        return False
+    across = directions @ np.column_stack(perpendicular_pair(unit(directions.mean(axis=0))))
+    spread = np.linalg.svd(across - across.mean(axis=0), compute_uv=False)
+    return bool(spread[1] > LINED_UP * spread[0])
+
+
+def _along_beams(directions: FloatArray, range_m: FloatArray, plane: Plane) -> Plane:
+    """The maximum-likelihood plane for noise along the beam, robust, by Gauss-Newton steps.
+
+    A threshold little wider than the noise keeps a plane where it started: as it moves, points leave on one side and
+    come in on the other. A redescending loss at several sigmas does not.
+    """
+    gate_m = WIDE_GATE * THRESHOLD_M
+    for _ in range(ML_STEPS):
+        slope = directions @ plane.normal
+        if np.abs(slope).min() < LEAST_SLOPE:
+            return plane
+        expected = plane.offset / slope
+        residual = range_m - expected
+        gate_m = min(gate_m, max(TUKEY_K * mad_sigma(residual, centred=True), 1e-4))
+        moved = _step(plane, directions, expected, slope, residual, gate_m)
+        if moved is None:
+            return plane
+        plane = moved
+    return plane
+
+
+def _step(
+    plane: Plane, directions: FloatArray, expected: FloatArray, slope: FloatArray, residual: FloatArray, gate_m: float
+) -> Plane | None:
+    """The plane after one weighted step of its shift and two tilts about the points' middle; None if undetermined."""
+    weight = (1.0 - np.minimum((residual / gate_m) ** 2, 1.0)) ** 2
+    middle = (directions * expected[:, None]).mean(axis=0)
+    across = np.column_stack(perpendicular_pair(plane.normal))
+    rows = np.empty((len(slope), 3))
+    rows[:, 0] = 1.0 / slope
+    rows[:, 1:] = ((middle @ across) - expected[:, None] * (directions @ across)) / slope[:, None]
+    try:
+        shift, *tilts = np.linalg.solve((rows * weight[:, None]).T @ rows, rows.T @ (weight * residual))
+    except np.linalg.LinAlgError:
+        return None
+    normal = plane.normal + across @ np.asarray(tilts)
+    return Plane(normal, float(normal @ middle) + shift)
 
 
 def _are_the_faces(planes: list[Plane], sighting: CornerCandidate) -> bool:
