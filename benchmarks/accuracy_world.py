@@ -168,7 +168,7 @@ def main() -> None:
         "Errors are the angle between true and estimated orientation, and the distance between their origins,",
         f"over {arguments.seeds} seeds. `ransac` and `harris` use one frame a place; the others all twenty. The",
         "bound is that of the returns that truly are of a face, each known to be. Regenerate with",
-        "`make accuracy-world`, which writes this whole file; what was measured otherwise stands in [world.md](world.md).",
+        "`make accuracy-world`, which writes this file; what was measured otherwise is in [world.md](world.md).",
         "",
     ]
     for pose in CASES:
