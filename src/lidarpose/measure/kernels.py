@@ -2,6 +2,9 @@
 
 The kernels release the interpreter's lock and run in the same threads as the NumPy way. They are kept on disk by
 numba, so that only the first process on a machine compiles them (about two seconds).
+
+They write each sweep as one flat row, x, y, z side by side: into a two-dimensional array the compiler stores one number
+at a time, at half the speed.
 """
 
 from __future__ import annotations
@@ -35,15 +38,16 @@ def _per_sweep(ranges: Any, matrix: Any, shift: Any, cosine: Any, sine: Any, poi
             rho = row[j] if row[j] > zero else nan
             rho = rho + (rho - rho)  # infinity becomes NaN without a branch
             x, y = rho * cosine[j], rho * sine[j]
-            out[j, 0] = a00 * x + a01 * y + t0
-            out[j, 1] = a10 * x + a11 * y + t1
-            out[j, 2] = a20 * x + a21 * y + t2
+            out[3 * j] = a00 * x + a01 * y + t0
+            out[3 * j + 1] = a10 * x + a11 * y + t1
+            out[3 * j + 2] = a20 * x + a21 * y + t2
 
 
 def _per_beam(ranges: Any, reading_deg: Any, beam: Any, matrix: Any, shift: Any, radius: Any, points: Any) -> None:
     zero, nan = ranges.dtype.type(0.0), ranges.dtype.type(np.nan)
     to_rad = np.pi / 180.0
     for i in range(ranges.shape[0]):
+        out = points[i]
         for j in range(ranges.shape[1]):
             rho = ranges[i, j]
             rho = rho if rho > zero else nan
@@ -52,9 +56,9 @@ def _per_beam(ranges: Any, reading_deg: Any, beam: Any, matrix: Any, shift: Any,
             c, s = np.cos(angle), np.sin(angle)
             u, v, z = rho * beam[0, j] + radius, rho * beam[1, j], rho * beam[2, j]
             x, y = c * u - s * v, s * u + c * v
-            points[i, j, 0] = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + shift[0]
-            points[i, j, 1] = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + shift[1]
-            points[i, j, 2] = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + shift[2]
+            out[3 * j] = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + shift[0]
+            out[3 * j + 1] = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + shift[1]
+            out[3 * j + 2] = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + shift[2]
 
 
 _compiled_per_sweep = njit(nogil=True, cache=True, error_model="numpy")(_per_sweep)
@@ -71,11 +75,12 @@ def block_per_sweep(
     shift = R_camera @ motion.T_turntable_lidar.translation + motion.T_camera_turntable.translation
     shift = shift.astype(points.dtype)
     cosine, sine = np.cos(theta).astype(points.dtype), np.sin(theta).astype(points.dtype)
+    flat = points.reshape(points.shape[0], 3 * points.shape[1])
 
     def work(first: int, last: int) -> None:
         rows = slice(first, last)
         ranges = np.ascontiguousarray(recording.range_m[rows], dtype=points.dtype)
-        _compiled_per_sweep(ranges, matrix[rows], shift[rows], cosine, sine, points[rows])
+        _compiled_per_sweep(ranges, matrix[rows], shift[rows], cosine, sine, flat[rows])
 
     return work
 
@@ -90,11 +95,12 @@ def block_per_beam(
     matrix = motion.T_camera_turntable.rotation.astype(points.dtype)
     shift = motion.T_camera_turntable.translation.astype(points.dtype)
     radius = points.dtype.type(motion.radius_m)
+    flat = points.reshape(points.shape[0], 3 * points.shape[1])
 
     def work(first: int, last: int) -> None:
         rows = slice(first, last)
         ranges = np.ascontiguousarray(recording.range_m[rows], dtype=points.dtype)
         reading = np.ascontiguousarray(recording.turntable_angle_deg[rows], dtype=np.float64)
-        _compiled_per_beam(ranges, reading, beam, matrix, shift, radius, points[rows])
+        _compiled_per_beam(ranges, reading, beam, matrix, shift, radius, flat[rows])
 
     return work
