@@ -1,0 +1,230 @@
+"""Which of several solutions is right: by the motion of all places, by the ends of the lines, or by the user's word.
+
+The rival is mostly the mirrored solution, with both lines exchanged at every place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from lidarpose.errors import InputError, UndeterminedError
+from lidarpose.geometry.arrays import FloatArray, IntArray, angle_between
+from lidarpose.geometry.planes import Plane, fit_plane, intersect_three_planes
+from lidarpose.geometry.se3 import Pose
+from lidarpose.model.observation import PlaceFeatures
+from lidarpose.solve.assignment_candidates import Candidate, Pool
+from lidarpose.solve.assignment_solutions import Solution, is_same, rms_misfit, support_of
+from lidarpose.solve.line_pair import fit_line_pair
+from lidarpose.solve.panel_pose import PanelPose
+from lidarpose.solve.single_pose import single_pose
+
+# One solution beats another where its residuals are this much smaller at least, and that is no chance: the logarithm of
+# the ratio of two equal deviations with n degrees of freedom scatters by sqrt(1/n) (more for small n).
+LEAST_RATIO = 2.0
+LEAST_DEVIATIONS = 5.0
+# What a panel's pose may be wrong by beyond twice its stated deviation, because neither boards nor lenses are perfect,
+# before one solution is held for better than another.
+PANEL_TURN_RAD = 3e-4
+PANEL_SHIFT_M = 2e-4
+# A rival whose places are off by this much needs no closer look.
+FAR_OFF_RAD = 0.005
+# Places that the closer look takes.
+LOOKED_AT = 10
+# It beats it too where the lines' ends agree so much better with the stripes' ends (difference of chi-squared).
+LEAST_ENDS_GAIN = 30.0
+# How unequally the ends of stripes may be cut off on both panels, by detection or by margins.
+ENDS_BIAS_M = 0.015
+HINT = "--first-panel"
+
+
+def decide(
+    pool: Pool,
+    solutions: list[Solution],
+    places: Sequence[PlaceFeatures],
+    panel_poses: Mapping[str, Sequence[PanelPose]],
+    first_panel: int | None,
+) -> tuple[Solution, str, dict[str, float]]:
+    """The solution that the evidence is for, what decided, and the figures. Raises where nothing decides."""
+    best = solutions[0]
+    solutions = [best, *(s for s in solutions[1:] if not is_same(best, s))]
+    figures = {"solutions": float(len(solutions)), "rms_sigmas": rms_misfit(best.misfit, support_of(best))}
+    look = partial(_rms_with_panels, pool, places, panel_poses)
+    rivals = [s for s in solutions[1:] if not _beaten_by_motion(pool, best, s, look)]
+    if len(solutions) > 1:
+        figures["rival_rms_sigmas"] = min(rms_misfit(s.misfit, support_of(best)) for s in solutions[1:])
+    decided_by = "the motion of all places" if len(solutions) > 1 else "no rival"
+    if rivals:
+        gains = [_ends_gain(pool, best, s) for s in rivals]
+        figures["ends_gain"] = min(gains)
+        if min(gains) < -LEAST_ENDS_GAIN:  # a rival's ends agree better, and its motion is no worse
+            best, rivals = rivals[int(np.argmin(gains))], [best, *rivals]
+            rivals = [s for s in rivals if s is not best]
+            gains = [_ends_gain(pool, best, s) for s in rivals]
+        rivals = [s for s, gain in zip(rivals, gains, strict=True) if gain < LEAST_ENDS_GAIN]
+        decided_by = "the ends of the lines"
+    if first_panel is not None:
+        return _by_hint(pool, best, rivals, places, first_panel, decided_by), _told(rivals, decided_by), figures
+    if rivals:
+        raise UndeterminedError(
+            "Nothing in the data tells which scan line lies on which panel: two mirrored solutions fit equally well",
+            remedy=f"Say it with {HINT} 1 or {HINT} 2 (the panel that the scan line of smaller beam angle lies on), "
+            "or tilt the board or shift one panel's end so that the two are no mirror images, and record again",
+        )
+    return best, decided_by, figures
+
+
+def _told(rivals: list[Solution], decided_by: str) -> str:
+    return f"the order given by {HINT}" if rivals else decided_by
+
+
+def _by_hint(
+    pool: Pool,
+    best: Solution,
+    rivals: list[Solution],
+    places: Sequence[PlaceFeatures],
+    first_panel: int,
+    decided_by: str,
+) -> Solution:
+    agreeing = [s for s in (best, *rivals) if _share_with_hint(pool, s, places, first_panel) > 0.5]
+    if not agreeing:
+        raise InputError(
+            HINT,
+            f"{decided_by} contradict it: the line of smaller beam angle does not lie on panel {first_panel + 1}",
+            remedy="Leave the option out, or check that the panels are in the session's order",
+        )
+    return agreeing[0]
+
+
+def _share_with_hint(pool: Pool, solution: Solution, places: Sequence[PlaceFeatures], first_panel: int) -> float:
+    votes = []
+    for c in solution.chosen[solution.chosen >= 0]:
+        candidate = pool.candidates[c]
+        first, second = (places[candidate.place].lines[k] for k in candidate.lines)
+        smaller = 0 if np.mean(first.angle_rad) < np.mean(second.angle_rad) else 1
+        votes.append(smaller == first_panel)
+    return float(np.mean(votes)) if votes else 0.0
+
+
+def _beaten_by_motion(pool: Pool, best: Solution, rival: Solution, look: Callable[[Solution, IntArray], float]) -> bool:
+    """Whether the rival's places fit one motion so much worse that neither chance nor the panels' poses explain it."""
+    support = support_of(best)
+    ours, theirs = rms_misfit(best.misfit, support), rms_misfit(rival.misfit, support)
+    if not np.isfinite(theirs):
+        return True
+    smallest = np.median([np.linalg.eigvalsh(c.sample.rotation_covariance())[0] for c in pool.candidates])
+    both = np.flatnonzero(support & (rival.chosen >= 0))
+    if len(both) < 3 or theirs * np.sqrt(smallest) < FAR_OFF_RAD:
+        both = both[np.unique(np.linspace(0, len(both) - 1, LOOKED_AT).astype(int))]
+        ours, theirs = look(best, both), look(rival, both)
+    else:
+        both = np.flatnonzero(support)
+    # Residuals far below the stated sigma are rounding, not evidence.
+    ratio = theirs / max(ours, 0.02)
+    freedom = max(6 * len(both) - 10, 1)
+    needed = LEAST_DEVIATIONS / np.sqrt(freedom) * (1.0 + 5.0 / freedom)
+    return bool(ratio > LEAST_RATIO and np.log(ratio) > needed)
+
+
+def _rms_with_panels(
+    pool: Pool,
+    places: Sequence[PlaceFeatures],
+    panel_poses: Mapping[str, Sequence[PanelPose]],
+    solution: Solution,
+    which: IntArray,
+) -> float:
+    """Root mean square misfit, in sigmas, of some places once the panels' poses may give way within their uncertainty.
+
+    An error of a panel's pose moves all samples together. The right solution hardly shows it, a mirrored one does, so
+    without this the panels' noise would decide between solutions that are equally good. One linear least squares
+    problem: motion and panels, with the panels' prior.
+    """
+    names = sorted({places[k].placement for k in which})
+    chosen = solution.chosen[which]
+    rows, right = [], []
+    for k, c in zip(which, chosen, strict=True):
+        candidate = pool.candidates[c]
+        poses = panel_poses[places[k].placement]
+        to_motion = solution.motion.pose_jacobian(pool.angle_rad[c])
+        back = solution.motion.pose(pool.angle_rad[c]).inverse().adjoint()
+        root = np.linalg.cholesky(pool.information[c]).T
+        e = back @ candidate.sample.pose.minus(solution.motion.pose(pool.angle_rad[c]))
+        by_panels = np.zeros((6, 12 * len(names)))
+        at = 12 * names.index(places[k].placement)
+        by_panels[:, at : at + 12] = back @ _moved_by_panels(candidate, poses)
+        rows.append(root @ np.hstack([-back @ to_motion, by_panels]))
+        right.append(root @ e)
+    prior = np.hstack([np.zeros((12 * len(names), 10)), np.eye(12 * len(names))])
+    A = np.vstack([*rows, prior])
+    b = np.concatenate([*right, np.zeros(len(prior))])
+    rest = b - A @ np.linalg.lstsq(A, b, rcond=1e-12)[0]
+    return float(np.sqrt(rest @ rest / (6 * len(which))))
+
+
+def _moved_by_panels(candidate: Candidate, poses: Sequence[PanelPose]) -> FloatArray:
+    """How a sample moves (6, 12), as left perturbation, for one deviation of each panel's pose in each direction."""
+    T = [poses[key].T_camera_panel for key in (0, 1)]
+    reference = _sample_on(candidate, (T[0], T[1]))
+    columns = []
+    for key in (0, 1):
+        middle = Pose(np.eye(3), candidate.stripes.E_camera).adjoint()
+        slack = np.diag([PANEL_SHIFT_M**2] * 3 + [PANEL_TURN_RAD**2] * 3)
+        spread = np.linalg.cholesky(4.0 * poses[key].covariance + middle @ slack @ middle.T)
+        for direction in 0.1 * spread.T:
+            moved = list(T)
+            moved[key] = Pose.exp(direction) @ T[key]
+            columns.append(_sample_on(candidate, (moved[0], moved[1])).minus(reference) / 0.1)
+    return np.stack(columns, axis=1)
+
+
+def _sample_on(candidate: Candidate, T_camera_panel: tuple[Pose, Pose]) -> Pose:
+    """The sample as it were if the panels stood a little differently."""
+    planes = (Plane.from_pose(T_camera_panel[0]), Plane.from_pose(T_camera_panel[1]))
+    points = np.vstack([p.intersect_rays(r) for p, r in zip(planes, candidate.rays_camera, strict=True)])
+    stripes = candidate.stripes
+    light = fit_plane(points, np.concatenate(stripes.light_plane.weights))
+    directions = []
+    for plane, old in zip(planes, stripes.directions_camera, strict=True):
+        direction = light.intersect_plane(plane).direction
+        directions.append(direction if direction @ old > 0.0 else -direction)
+    moved = replace(
+        stripes,
+        light_plane=replace(stripes.light_plane, plane=light),
+        E_camera=intersect_three_planes((*planes, light)),
+        directions_camera=np.stack(directions),
+        alpha_rad=float(angle_between(*directions)),
+    )
+    return single_pose(moved, fit_line_pair(*candidate.fits, moved.alpha_rad)).pose
+
+
+def _ends_gain(pool: Pool, best: Solution, rival: Solution) -> float:
+    """By how much chi-squared of the lines' ends, against the stripes' ends, is smaller for the best than the rival.
+
+    Only the difference between both panels counts: detection may well cut off stripes and lines, but alike on both. An
+    unknown inequality of that is allowed for, the same at all places.
+    """
+    both = np.flatnonzero((best.chosen >= 0) & (rival.chosen >= 0))
+    if len(both) == 0:
+        return 0.0
+    chi2 = []
+    spacing = float(np.median([pool.candidates[best.chosen[p]].spacing_m for p in both]))
+    for solution in (best, rival):
+        chosen = [pool.candidates[solution.chosen[p]] for p in both]
+        off = np.stack([c.extents_m - c.stripes.extents_m for c in chosen])
+        chi2.append(off[:, 0] - off[:, 1])
+    # Scatter from place to place, of the better one, never below two beams.
+    scatter = [float(np.median(np.abs(d - np.median(d, axis=0)))) * 1.4826 for d in chi2]
+    sigma = max(min(scatter), 2.0 * spacing, 0.003)
+    values = [_chi2_with_bias(d[:, 0], sigma) + _chi2_with_bias(d[:, 1], sigma) for d in chi2]
+    return values[1] - values[0]
+
+
+def _chi2_with_bias(differences: FloatArray, sigma: float) -> float:
+    """Chi-squared of values (N,) with noise `sigma` and one common unknown bias; outlying values are bounded."""
+    d = np.clip(differences, -0.2, 0.2)
+    total, n = float(d.sum()), len(d)
+    common = ENDS_BIAS_M**2 / (sigma**2 + n * ENDS_BIAS_M**2)
+    return (float(d @ d) - common * total**2) / sigma**2
