@@ -83,8 +83,7 @@ def calibrate(
         Write report.html too.
     """
     from lidarpose.storage.atomic import prepare_folder
-    from lidarpose.storage.corner_session import CORNER_SESSION_FORMAT
-    from lidarpose.storage.session import SESSION_FORMAT, session_format
+    from lidarpose.storage.session import CORNER_SESSION_FORMAT, SESSION_FORMAT, session_format
 
     prepare_folder(output)
     found = session_format(session)

@@ -43,8 +43,7 @@ def inspect(
     table_turns
         The same for the turntable as its readings grow.
     """
-    from lidarpose.storage.corner_session import CORNER_SESSION_FORMAT
-    from lidarpose.storage.session import SESSION_FORMAT, session_format
+    from lidarpose.storage.session import CORNER_SESSION_FORMAT, SESSION_FORMAT, session_format
 
     found = session_format(session)
     if found == CORNER_SESSION_FORMAT:

@@ -21,12 +21,11 @@ from lidarpose.storage.calibration import read_calibration
 from lidarpose.storage.documents import Schema, check_format, parse, read_toml, shown
 from lidarpose.storage.limits import find_files
 from lidarpose.storage.provenance import provenance
-from lidarpose.storage.session import LidarSection, inside
+from lidarpose.storage.session import CORNER_SESSION_FORMAT, LidarSection, inside
 from lidarpose.storage.session_folder import check_free
 from lidarpose.storage.tables import TextTable, read_text_table
 from lidarpose.storage.truth import truth_path
 
-CORNER_SESSION_FORMAT = "lidarpose/corner-session@1"
 CLOUD_SUFFIXES = (".pcd", ".ply", ".las", ".laz", ".e57", ".npy")
 MAX_PLACES = 10_000
 MAX_WORLD_M = 1e7

@@ -26,7 +26,8 @@ _MAX_DOTS = 256
 class Schema(BaseModel):
     """Base of the file schemas: unknown keys, NaN and infinity are errors; numbers are numbers, not text."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True, strict=True)
+    # Validators are built at first use: a command needs few of them.
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True, strict=True, defer_build=True)
 
 
 S = TypeVar("S", bound=BaseModel)

@@ -28,6 +28,7 @@ from lidarpose.storage.limits import find_files, is_file
 from lidarpose.storage.tables import TextTable, read_number_table, read_text_table
 
 SESSION_FORMAT = "lidarpose/turntable-session@1"
+CORNER_SESSION_FORMAT = "lidarpose/corner-session@1"
 MAX_PLACES = 10_000
 # A beam beyond this is no 2D LiDAR's on a turntable but one in millimetres.
 MAX_RANGE_M = 500.0
