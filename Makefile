@@ -7,7 +7,7 @@ BENCH_VENV := .venv-bench
 BENCH_STAMP := $(BENCH_VENV)/.installed
 BENCH_PYTHON = $(if $(wildcard $(BENCH_STAMP)),$(BENCH_VENV),$(VENV))/bin/python
 
-.PHONY: setup demo test test-slow check format lock gallery bench bench-quick bench-setup accuracy accuracy-world clean
+.PHONY: setup demo test test-slow check format lock gallery bench bench-compare bench-quick bench-setup accuracy accuracy-world clean
 
 setup: $(STAMP)
 
@@ -57,6 +57,10 @@ $(BENCH_STAMP): requirements-bench.lock pyproject.toml
 # Accuracy and speed against peers and limits, on an idle machine: docs/benchmarks.md and .json. A quarter of an hour.
 bench: setup
 	$(BENCH_PYTHON) -m benchmarks.run --write
+
+# The same again, saying which figures differ from the stored ones by more than their tolerance.
+bench-compare: setup
+	$(BENCH_PYTHON) -m benchmarks.run --compare docs/benchmarks.json
 
 # The same with small sizes, printed only: minutes, to see that all works.
 bench-quick: setup

@@ -88,6 +88,17 @@ print(time.perf_counter() - begin)
 """
 
 
+def first_compiling(beams: int) -> float | None:
+    """Seconds of a process that finds no kernels on the disk and compiles them; None without numba."""
+    if not has_compiler():
+        return None
+    with tempfile.TemporaryDirectory() as empty:
+        command = [sys.executable, "-c", _ONE_SHOT, str(100 * beams), str(beams), "compiled"]
+        environment = {**os.environ, "NUMBA_CACHE_DIR": empty}
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
+    return float(done.stdout)
+
+
 def one_shot(points: int, beams: int, repeats: int = 3) -> list[float | None]:
     """Seconds of assembling once in a new process: by NumPy, compiled, and as the package chooses by itself."""
     times: dict[str, list[float]] = {"numpy": [], "compiled": [], "default": []}
