@@ -67,6 +67,8 @@ def test_half_a_turn_of_yaw_costs_nothing() -> None:
         ("swapped", "swapped"),
         ("5 cm", "p01"),
         ("1 %", "times"),
+        ("10 cm", "p01 is left out: by the other places its corner stands 100 mm from its world coordinates (row 2"),
+        ("not moved", "it stands at the coordinates of p03"),
     ],
 )
 def test_mistakes_in_the_coordinates_are_named(simulated: Simulated, mistake: str, named: str) -> None:
@@ -78,8 +80,24 @@ def test_mistakes_in_the_coordinates_are_named(simulated: Simulated, mistake: st
         "swapped": world[[1, 0, 2, 3, 4]],
         "5 cm": world + 0.05 * np.outer(np.arange(5) == 1, [0.0, 1.0, 0.0]),
         "1 %": 1.01 * world,
+        "10 cm": world + 0.1 * np.outer(np.arange(5) == 1, [0.0, 1.0, 0.0]),
+        "not moved": world,
     }[mistake]
-    assert named in reasons(calibrate_world(with_world(session, wrong)))
+    changed = with_world(session, wrong)
+    if mistake == "not moved":
+        # The target was not moved between two places.
+        places = list(changed.places)
+        places[1] = replace(places[1], clouds=places[3].clouds)
+        changed = replace(changed, places=tuple(places))
+    assert named in reasons(calibrate_world(changed))
+
+
+def test_a_target_turned_far_is_named() -> None:
+    spec = CornerSceneSpec(frames=2, places=5, seed=3, turned_place=2, turned_deg=15.0)
+    session, truth = simulate_corner_session(spec)
+    result = calibrate_world(session)
+    assert "p02 is left out: the target seems turned by 15 deg" in reasons(result)
+    assert result.T_world_source.distance(truth.T_world_lidar)[0] < 0.003
 
 
 def test_a_turned_target_is_named() -> None:

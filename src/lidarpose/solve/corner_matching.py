@@ -25,6 +25,8 @@ TOLERANCE_M = 0.06
 STILL_M = 0.05
 MOVED_M = 0.15
 MAX_SEEDS = 4000
+# A target turned by more than this is not known again.
+MAX_TURN_RAD = np.radians(44.0)
 
 _ORDERS = np.array(list(permutations(range(3))))
 
@@ -96,6 +98,61 @@ def match_corners(
             if kept is None or match.rms_m < kept.rms_m:
                 found[match.choice] = match
     return tuple(sorted(found.values(), key=lambda m: (-m.places, m.rms_m)))
+
+
+@dataclass(frozen=True, eq=False)
+class Stray:
+    """A corner at a place where none fits that is nearly the target's: what keeps it from fitting.
+
+    Attributes
+    ----------
+    corner_world : (3,)
+        Where it stands by the other places' pose.
+    off : (3,)
+        That, minus the place's world coordinates.
+    turned_rad
+        How far its faces are turned against the target's.
+    """
+
+    corner_world: FloatArray
+    off: FloatArray
+    turned_rad: float
+
+
+def nearest_strays(
+    candidates: Sequence[Sequence[CornerCandidate]], match: CornerMatch, world: FloatArray
+) -> dict[int, Stray]:
+    """For places without a corner in a match: the corner there that is the target moved, or else the target turned.
+
+    A target that stands elsewhere keeps its orientation; a target that was turned stands where it should.
+    """
+    nodes = _collect(candidates)
+    if len(nodes.place) == 0:
+        return {}
+    # Not the background; but the target itself may have been left where it was at another place.
+    expected = match.T_world_lidar.inverse() @ world
+    known = (np.linalg.norm(nodes.corner[:, None] - expected, axis=-1) < TOLERANCE_M).any(axis=1)
+    eligible = _moving(nodes, world) | known
+    first = next(p for p, c in enumerate(match.choice) if c is not None)
+    reference = candidates[first][match.choice[first] or 0]
+    found: dict[int, Stray] = {}
+    for place in (p for p, c in enumerate(match.choice) if c is None):
+        here = np.flatnonzero((nodes.place == place) & eligible & (nodes.convex == reference.convex))
+        strays = [_stray(match, nodes.corner[k], nodes.normals[k], reference.normals, world[place]) for k in here]
+        elsewhere = [s for s in strays if s.turned_rad < SAME_ORIENTATION_RAD]
+        turned = [s for s in strays if np.linalg.norm(s.off) < 2.0 * TOLERANCE_M and s.turned_rad < MAX_TURN_RAD]
+        if turned and not any(np.linalg.norm(s.off) < 2.0 * TOLERANCE_M for s in elsewhere):
+            found[place] = min(turned, key=lambda s: s.turned_rad)
+        elif elsewhere:
+            found[place] = min(elsewhere, key=lambda s: float(np.linalg.norm(s.off)))
+    return found
+
+
+def _stray(
+    match: CornerMatch, corner: FloatArray, normals: FloatArray, reference: FloatArray, world: FloatArray
+) -> Stray:
+    stands = np.asarray(match.T_world_lidar @ corner)
+    return Stray(stands, stands - world, face_order(normals, reference)[1])
 
 
 def _collect(candidates: Sequence[Sequence[CornerCandidate]]) -> _Nodes:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -19,7 +19,14 @@ from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, Fac
 from lidarpose.model.corner_session import NEAR_RADIUS_M, CloudSource, CornerPlace, CornerSession
 from lidarpose.model.observation import LeftOut
 from lidarpose.refine.corner_model import FreeCorner, direction_cells, face_residuals, fit_corner
-from lidarpose.solve.corner_matching import CornerMatch, match_corners
+from lidarpose.solve.corner_matching import (
+    SAME_ORIENTATION_RAD,
+    TOLERANCE_M,
+    CornerMatch,
+    Stray,
+    match_corners,
+    nearest_strays,
+)
 
 # A hint is right within 0.3 m, and a target no larger than this beyond the corner.
 HINT_CROP_M = 1.5
@@ -45,6 +52,8 @@ class FoundTarget:
         The world coordinates under which the corners fit: those of the session unless `oddity` names what is wrong.
     oddity
         Why the session's own coordinates do not fit, for the user; empty if they do.
+    strays
+        By place without a sighting: what stands there instead, for the user.
     """
 
     sightings: tuple[CornerCandidate | None, ...]
@@ -52,6 +61,7 @@ class FoundTarget:
     world: FloatArray
     oddity: str
     ambiguous: bool
+    strays: Mapping[int, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +159,30 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
         None if k is None else _reordered(here[k], order)
         for here, k, order in zip(candidates, best.choice, best.orders, strict=True)
     )
-    return FoundTarget(sightings, best, world, oddity, _is_ambiguous(matches, world))
+    strays = {
+        k: _stray_in_words(session, world, k, stray) for k, stray in nearest_strays(candidates, best, world).items()
+    }
+    return FoundTarget(sightings, best, world, oddity, _is_ambiguous(matches, world), strays)
+
+
+def _stray_in_words(session: CornerSession, world: FloatArray, place: int, stray: Stray) -> str:
+    """What is wrong with a place whose target stands elsewhere, or turned."""
+    if stray.turned_rad >= SAME_ORIENTATION_RAD:
+        return (
+            f"the target seems turned by {np.degrees(stray.turned_rad):.0f} deg there against the other places; it "
+            "must keep its orientation"
+        )
+    x, y, z = (f"{1e3 * v:+.0f}" for v in stray.off)
+    text = (
+        f"by the other places its corner stands {1e3 * np.linalg.norm(stray.off):.0f} mm from its world coordinates "
+        f"(row {place + 1} of the positions would fit with {x}, {y}, {z} mm)"
+    )
+    apart = np.linalg.norm(world - stray.corner_world, axis=1)
+    apart[place] = np.inf
+    other = int(np.argmin(apart))
+    if apart[other] < TOLERANCE_M:
+        text += f"; it stands at the coordinates of {session.places[other].position}: swapped?"
+    return text
 
 
 def place_corners(place: CornerPlace, seed: int = 0, frame: int = 0) -> tuple[CornerCandidate, ...]:
@@ -359,13 +392,18 @@ def observe(
     """Returns of the faces at each place, selected by common normals; what is left out, and why."""
     places, left_out = [], []
     reference = max((s for s in found.sightings if s is not None), key=lambda s: s.support)
-    for place, sighting, crop, corner in zip(session.places, found.sightings, crops, corners, strict=True):
+    for k, (place, sighting, crop, corner) in enumerate(
+        zip(session.places, found.sightings, crops, corners, strict=True)
+    ):
         mask = mask_of(sighting or reference, corner, normals)
         faces = select_faces(crop, mask, GATE_SIGMAS * sigma_m, sigma_m)
-        if sighting is None:
+        if k in found.strays:
+            faces = {}
+        elif sighting is None:
             faces = _trusted(faces, crop, mask_of(reference, corner, normals), sigma_m)
         if not faces:
-            left_out.append(LeftOut(place.position, "no target where the other places put it"))
+            reason = found.strays.get(k, "no target where the other places put it")
+            left_out.append(LeftOut(place.position, reason))
         missing = [j for j in range(3) if faces and j not in faces]
         left_out += [LeftOut(f"{place.position}, face {j + 1}", "too few returns") for j in missing]
         places.append(CornerPlaceFaces(place.position, place.corner_world, faces, crop.frames))
