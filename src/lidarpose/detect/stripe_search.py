@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -66,6 +67,11 @@ class PanelView:
     nodes: FloatArray
     slopes: FloatArray
 
+    @cached_property
+    def nodes_and_slopes(self) -> FloatArray:
+        """Both, one row (h * w, 6) a node."""
+        return np.concatenate([self.nodes, self.slopes], axis=-1).reshape(-1, 6)
+
     @staticmethod
     def make(albedo: PanelAlbedo, bright: GrayImage | FloatArray) -> PanelView:
         """From the panel's albedo and the whole bright image."""
@@ -107,13 +113,13 @@ class PanelView:
         height, width = self.nodes.shape[:2]
         i = np.clip(column.astype(np.intp), 0, width - 2)
         j = np.clip(row.astype(np.intp), 0, height - 2)
-        x, y = (column - i)[..., None], (row - j)[..., None]
-        found = []
-        for table in (self.nodes, self.slopes):
-            upper = table[j, i] * (1.0 - x) + table[j, i + 1] * x
-            lower = table[j + 1, i] * (1.0 - x) + table[j + 1, i + 1] * x
-            found.append(upper * (1.0 - y) + lower * y)
-        return found[0], found[1]
+        x, y = (column - i).astype(np.float32)[..., None], (row - j).astype(np.float32)[..., None]
+        first = j * width + i
+        table = self.nodes_and_slopes
+        upper = table.take(first, axis=0) * (1 - x) + table.take(first + 1, axis=0) * x
+        lower = table.take(first + width, axis=0) * (1 - x) + table.take(first + width + 1, axis=0) * x
+        found = upper * (1 - y) + lower * y
+        return found[..., :2], found[..., 2:]
 
     def with_model(self) -> PanelView:
         """The same with the bright image as squares, levels and blur make it: without what else there is in it.
