@@ -9,14 +9,14 @@ What the instrument returns tells F:
 - a range between material and background (mixed pixels), whose place between the two is on the average the share of
   the light that comes from the background: 1 - F where both are as bright, k (1 - F) / (F + k (1 - F)) in general. The
   brightness k is a parameter: it skews the way from one to the other, which a shift of the edge does not. The scatter
-  about it, kappa F (1 - F), is a parameter too: 0 for instruments that average by energy, 1/3 for ones that return
-  anything between, 1 for ones that return either;
+  about it is a parameter too, and so is the share of mixed pixels that lie anywhere between the two;
 - no return near the edge only (mixed pixels dropped): as likely on either side of it;
 - no return beyond the edge (no background in reach): the edge of what is seen.
 
 The kind of spot is chosen by the data; its width, scatter and dropping are parameters beside centre and radius, and all
-are integrated out by sampling the posterior. Without mixed returns the likelihood is a flat box with steep walls (each
-pair of neighbours brackets the edge), which has no smooth maximum, and whose middle and width are what is wanted.
+are integrated out by sampling the posterior. What the beams' own scatter says beyond the model widens it
+(`_inflation`). Without mixed returns the likelihood is a flat box with steep walls (each pair of neighbours brackets
+the edge), which has no smooth maximum, and whose middle and width are what is wanted.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray
-from lidarpose.measure.sampling import WALKERS, LogDensity, anneal, climb, sample, scatter_about
+from lidarpose.measure.sampling import WALKERS, LogDensity, anneal, climb, sample, sample_about, scatter_about
 
 # Spot widths (standard deviations) that the prior allows, metres.
 SMALLEST_SPOT_M, LARGEST_SPOT_M = 4e-5, 1e-2
@@ -104,7 +104,8 @@ class EdgeFit:
     spot_m
         Width of the spot as a standard deviation (median), metres.
     scatter
-        kappa above (median).
+        Four times the variance that mixed pixels have at the edge beyond the noise, in squares of the way to the
+        background (median).
     lost_share
         Share of mixed pixels that are dropped (median).
     """
@@ -166,38 +167,56 @@ def _sorted(beams: EdgeBeams, stretch: FloatArray, reach: float, straight: bool)
     )
 
 
-def _log_likelihood(x: FloatArray, data: _Sorted, inside: bool, dropout: float) -> FloatArray:
-    """Log-likelihood (k,) of parameters (k, 9), in the order of `_USUAL`."""
-    radius, spot = x[:, 2, None], np.exp(x[:, 3, None])
-    scatter, lost = np.exp(x[:, 4, None]), x[:, 5, None]
-    if data.straight:
-        s, sagitta = data.place[:, 0] - x[:, 0, None] - x[:, 1, None] * data.place[:, 1], np.zeros_like(spot)
-    else:
-        s = np.hypot(data.place[:, 0] - x[:, 0, None], data.place[:, 1] - x[:, 1, None]) - radius
-        # Of a spot centred on the edge of a disk less than half is on it, by the sagitta of the arc.
-        sagitta = 0.5 * spot**2 / radius
-    u = (s + sagitta) / (spot * data.stretch)
+def _log_terms(x: FloatArray, data: _Sorted, inside: bool, dropout: float) -> FloatArray:
+    """Log-likelihood (k, n) of each beam for parameters (k, 10), in the order of `_USUAL`."""
+    s, u = _distances(x, data)
     F = _share(-u if inside else u, x[:, 8, None])
     a, b, c = data.ends
-    # Light weighs the two ranges: a background k times as bright as the material pulls the mean its way.
-    share = F[:, :a] / (F[:, :a] + np.exp(x[:, 7, None]) * (1.0 - F[:, :a]))
-    mixed = share * (1.0 - share)
-    variance = share * data.near_variance + (1.0 - share) * data.far_variance + scatter * mixed
-    normal = np.exp(-0.5 * (data.depth - 1.0 + share) ** 2 / variance) / np.sqrt(2.0 * np.pi * variance)
-    kept = 1.0 - np.minimum(dropout + (1.0 - dropout) * lost * 4.0 * mixed, 1.0 - 1e-9)
-    # An outlier may lie anywhere between material and background, and a little beyond.
-    total = np.log(kept * ((1.0 - _OUTLIERS) * normal + _OUTLIERS / 1.5)).sum(axis=1)
+    scatter, lost = np.exp(x[:, 4, None]), _logistic(x[:, 5, None])
+    terms = np.empty(F.shape)
+    terms[:, :a] = _log_depth(x, data, F[:, :a], u[:, :a], lost, dropout)
     if b > a:
-        none = F[:, a:b]
-        total += np.log(dropout + (1.0 - dropout) * lost * 4.0 * none * (1.0 - none) + 1e-9).sum(axis=1)
-    if len(data.place) > b:
+        terms[:, a:b] = np.log(dropout + (1.0 - dropout) * lost * _both(u[:, a:b]) + 1e-9)
+    if F.shape[1] > b:
         # Seen where the share passes an unknown threshold: a sharp edge, displaced by a part of the spot.
-        past = (s[:, b:] + x[:, 6, None] * spot * data.stretch[b:]) / data.softness
+        past = (s[:, b:] + x[:, 6, None] * np.exp(x[:, 3, None]) * data.stretch[b:]) / data.softness
         seen = (1.0 - dropout) * ndtr(-past if inside else past) * (1.0 - 2.0 * _OUTLIERS) + _OUTLIERS
-        total += np.log(seen[:, : c - b]).sum(axis=1) + np.log1p(-seen[:, c - b :]).sum(axis=1)
+        terms[:, b:c], terms[:, c:] = np.log(seen[:, : c - b]), np.log1p(-seen[:, c - b :])
         if data.light is not None:
-            total += _log_light(data.light, F[:, b:c], scatter, data.light_sigma).sum(axis=1)
-    return np.asarray(total)
+            excess = 0.25 * scatter * np.sqrt(_both(u[:, b:c]))
+            terms[:, b:c] += _log_light(data.light, F[:, b:c], excess, data.light_sigma)
+    return terms
+
+
+def _distances(x: FloatArray, data: _Sorted) -> tuple[FloatArray, FloatArray]:
+    """How far off the material each beam's axis lies (k, n), in metres, and in widths of the spot for its share."""
+    radius, spot = x[:, 2, None], np.exp(x[:, 3, None])
+    if data.straight:
+        s = data.place[:, 0] - x[:, 0, None] - x[:, 1, None] * data.place[:, 1]
+        return s, s / (spot * data.stretch)
+    s = np.hypot(data.place[:, 0] - x[:, 0, None], data.place[:, 1] - x[:, 1, None]) - radius
+    u = s / (spot * data.stretch)
+    # Of a spot centred on the edge of a disk less than half is on it, by the arc's mean sagitta under the spot: the
+    # mean square along the cut is spot^2 for a Gaussian one, a third of the half chord's for an even one.
+    square = 1.0 + x[:, 8, None] * (np.maximum(4.0 - u * u, 0.0) / 3.0 - 1.0)
+    return s, u + 0.5 * spot / (radius * data.stretch) * square
+
+
+def _log_depth(
+    x: FloatArray, data: _Sorted, F: FloatArray, u: FloatArray, lost: FloatArray, dropout: float
+) -> FloatArray:
+    """Log-density (k, n) of the depths of beams before a background, of which F of the spot is on the material."""
+    # Light weighs the two ranges: a background k times as bright as the material pulls the mean its way.
+    share = F / (F + np.exp(x[:, 7, None]) * (1.0 - F))
+    both = _both(u)
+    excess = np.exp(x[:, 4, None]) * 0.25 * np.sqrt(both)
+    variance = share * data.near_variance + (1.0 - share) * data.far_variance + excess
+    normal = np.exp(-0.5 * (data.depth - 1.0 + share) ** 2 / variance) / np.sqrt(2.0 * np.pi * variance)
+    kept = 1.0 - np.minimum(dropout + (1.0 - dropout) * lost * both, 1.0 - 1e-9)
+    # A mixed pixel may lie anywhere between material and background, an outlier a little beyond as well.
+    between = _logistic(x[:, 9, None]) * both
+    anywhere = between * ((data.depth > -0.05) & (data.depth < 1.05)) / 1.1
+    return np.asarray(np.log(kept * ((1.0 - _OUTLIERS) * ((1.0 - between) * normal + anywhere) + _OUTLIERS / 1.5)))
 
 
 def _share(u: FloatArray, evenness: FloatArray) -> FloatArray:
@@ -210,9 +229,18 @@ def _share(u: FloatArray, evenness: FloatArray) -> FloatArray:
     return np.asarray((1.0 - evenness) * ndtr(u) + evenness * disk)
 
 
-def _log_light(light: FloatArray, share: FloatArray, scatter: FloatArray, sigma: float) -> FloatArray:
+def _both(u: FloatArray) -> FloatArray:
+    """How surely (k, n) a spot lies on both surfaces, at u of its widths from the edge.
+
+    Smooth and wider than 4 F (1 - F): nobody knows a spot so well that nothing were to doubt where it ends.
+    """
+    v = 0.25 * u * u
+    return np.asarray(np.exp(-2.0 * v * v))
+
+
+def _log_light(light: FloatArray, share: FloatArray, excess: FloatArray, sigma: float) -> FloatArray:
     """Log-density (k, n) of the light of hits, which is the share of the spot on the material."""
-    variance = sigma**2 + scatter * share * (1.0 - share)
+    variance = sigma**2 + excess
     normal = np.exp(-0.5 * (light - share) ** 2 / variance) / np.sqrt(2.0 * np.pi * variance)
     known = np.log((1.0 - _OUTLIERS) * normal + _OUTLIERS / 1.5)
     return np.where(np.isfinite(light), known, 0.0)
@@ -247,13 +275,14 @@ def fit_edge(
 
     shape = np.array([centre[0], centre[1], radius])
     problem = _Problem(beams, stretch, reach, False, inside, dropout, round_prior)
-    samples = _explore(problem, shape, np.full(3, 0.3 * reach), seed)
-    covariance = np.cov(samples[:, :3].T)
+    samples, inflation = _explore(problem, shape, np.full(3, 0.3 * reach), seed)
+    covariance = np.cov(samples[:, :3].T) * np.sqrt(np.outer(inflation, inflation))
     if not tells_threshold(beams):
         covariance[2, 2] += threshold_variance(stretch)
     mean = samples[:, :3].mean(axis=0)
     spot, scatter = np.exp(np.median(samples[:, 3:5], axis=0))
-    return EdgeFit(mean[:2], float(mean[2]), covariance, float(spot), float(scatter), float(np.median(samples[:, 5])))
+    lost = float(np.median(_logistic(samples[:, 5])))
+    return EdgeFit(mean[:2], float(mean[2]), covariance, float(spot), float(scatter), lost)
 
 
 # A straight edge may deviate by this from the direction that the planes beside it give it, radians.
@@ -275,8 +304,9 @@ def fit_straight_edge(
         return np.where(near, -0.5 * (x[:, 1] / _SLOPE_SIGMA) ** 2, -np.inf)
 
     problem = _Problem(beams, stretch, reach, True, True, dropout, straight_prior)
-    samples = _explore(problem, np.array([offset, 0.0, 0.0]), np.array([0.3 * reach, 0.5 * _SLOPE_SIGMA, 0.0]), seed)
-    variance = float(np.var(samples[:, 0]))
+    off = np.array([0.3 * reach, 0.5 * _SLOPE_SIGMA, 0.0])
+    samples, inflation = _explore(problem, np.array([offset, 0.0, 0.0]), off, seed)
+    variance = float(np.var(samples[:, 0]) * inflation[0])
     if not tells_threshold(beams):
         variance += threshold_variance(stretch)
     return float(samples[:, 0].mean()), variance
@@ -316,56 +346,144 @@ class _Problem:
         close = np.abs(s) < distance
         return replace(self, beams=self.beams.at(close), stretch=self.stretch[close])
 
+    def blurred(self, depth: float) -> _Problem:
+        """The problem as if depths were noisier by so much."""
+        sigma = np.hypot(self.beams.depth_sigma, depth)
+        return replace(self, beams=replace(self.beams, depth_sigma=sigma))
+
     def active(self) -> BoolArray:
-        """Which of the nine parameters the data can tell; the others stay at their usual values."""
+        """Which of the ten parameters the data can tell; the others stay at their usual values."""
         beams = self.beams
         bounded, open_ = bool(np.any(~beams.open)), bool(np.any(beams.open))
         spot = tells_threshold(beams)
         lost = bool(np.any(~beams.open & ~np.isfinite(beams.depth)))
-        return np.array([True, True, not self.straight, spot, spot, lost, spot and open_, bounded, False])
+        # Without mixed ranges nothing tells of what they are made.
+        mixed = bounded and self.mixed() >= _FEW_MIXED
+        return np.array([True, True, not self.straight, spot, spot, lost, spot and open_, mixed, False, mixed])
+
+    def mixed(self) -> int:
+        """How many ranges clearly lie between material and background."""
+        depth, sigma = self.beams.depth, self.beams.depth_sigma
+        with np.errstate(invalid="ignore"):
+            between = (depth > 5.0 * sigma[:, 0]) & (depth < 1.0 - 5.0 * sigma[:, 1])
+        return int(np.count_nonzero(between & ~self.beams.open))
 
 
-# Shape (centre x, y, radius; or offset, slope), log spot, log scatter, share of mixed lost, threshold, log contrast,
-# evenness of the spot.
-_USUAL = np.array([0.0, 0.0, 0.0, np.log(_USUAL_SPOT_M), np.log(0.03), 0.0, 0.0, 0.0, 0.5])
+# Shape (centre x, y, radius; or offset, slope), log spot, log scatter, share of mixed lost (as the logarithm of its
+# odds), threshold, log contrast, evenness of the spot, share of mixed pixels that lie anywhere (likewise).
+_USUAL = np.array([0.0, 0.0, 0.0, np.log(_USUAL_SPOT_M), np.log(0.03), -12.0, 0.0, 0.0, 0.5, -12.0])
+# The search first sees depths blurred by this, then by less and less, so that no side valley holds it.
+_BLUR, _SHARPEN = 0.1, 0.2
+# Kinds of spot (see `_share`), which a larger blur hides; one that is worse by so much is not tried again.
+_KINDS, _KINDS_BLUR, _HOPELESS = (0.0, 0.5, 1.0), 0.01, 30.0
+# Of the priors of these parameters where they are not even; for the odds, of an even prior of the share at a half.
+_PRIOR_CURVATURE = np.array([0, 0, 0, _SPOT_SPREAD**-2, 0, 0.5, 1, _CONTRAST_SIGMA**-2, 0, 0.5])
+# Fewer mixed ranges than this may be outliers.
+_FEW_MIXED = 12
+# Of the circle, for the scatter of the beams' scores.
+_SECTORS = 24
+# The same edge seen with another kind of spot, whose width is another: changes of the logarithm of the spot.
+_RESCALED = np.linspace(-0.3, 0.3, 13)[:, None] * (np.arange(10) == 3)
 
 
-def _explore(problem: _Problem, shape: FloatArray, off: FloatArray, seed: int) -> FloatArray:
-    """Samples (n, 9) of the posterior, from a first estimate of the shape (3,) that may be `off` (3,)."""
+def _logistic(odds: FloatArray) -> FloatArray:
+    """The share (...) of which `odds` is the logarithm of the odds."""
+    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * odds)))
+
+
+def _explore(problem: _Problem, shape: FloatArray, off: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Samples (n, 10) of the posterior, from a first estimate of the shape (3,) that may be `off` (3,)."""
     rng = np.random.default_rng(seed)
     active = problem.active()
     usual = _USUAL.copy()
-    usual[:3] = shape
-    walkers = anneal(_posterior(problem, active, usual), _start(shape, off, problem.reach, rng)[:, active], rng)
+    usual[:3], usual[8] = shape, _KINDS[0]
+    start = _start(shape, off, problem.reach, rng)[:, active]
+    walkers = anneal(_posterior(problem.blurred(_BLUR), active, usual), start, rng)
     if active[3]:
-        walkers, usual = _best_spot(problem, walkers, active, usual, rng)
-    # Beams far from the edge, in widths of the spot, say nothing more.
-    full = _completed(walkers, active, usual)
-    width = 6.0 * float(np.exp(full[:, 3].max())) * problem.stretch + 1.5 * problem.reach
-    near = problem.near(full[:, :3].mean(axis=0), width)
-    return _completed(sample(_posterior(near, active, usual), walkers, rng), active, usual)
+        problem, walkers, usual = _sharpened(problem, walkers, active, usual, rng)
+    density = _posterior(problem, active, usual)
+    top, _, covariance = climb(density, walkers)
+    samples = None if covariance is None else sample_about(density, top, covariance, rng)
+    samples = sample(density, walkers, rng) if samples is None else samples
+    return _completed(samples, active, usual), _inflation(problem, samples, active, usual)
 
 
-def _best_spot(
+def _inflation(problem: _Problem, samples: FloatArray, active: BoolArray, usual: FloatArray) -> FloatArray:
+    """By what factor (3,) at least the shape's variances are larger than the posterior's, from the beams themselves.
+
+    The posterior believes the model. If that is wrong in the spot or the mixing, the scores of the beams scatter more
+    than its curvature says, or together along the edge: the variance is then H^-1 J H^-1 with the scatter J of the
+    scores' sums by sectors (Huber, 1967, with sectors for his observations). Priors enter J by their curvature.
+    """
+    inflation = np.ones(3)
+    if not active[3]:
+        return inflation
+    mean, covariance = samples.mean(axis=0), np.cov(samples.T)
+    sums = _sector_scores(problem, _completed(mean[None], active, usual)[0], active, np.sqrt(np.diag(covariance)))
+    sums -= sums.mean(axis=0)
+    J = sums.T @ sums * len(sums) / max(len(sums) - 1, 1) + np.diag(_PRIOR_CURVATURE[active])
+    ratio = np.diag(covariance @ J @ covariance) / np.diag(covariance)
+    inflation[active[:3]] = np.maximum(ratio[: np.count_nonzero(active[:3])], 1.0)
+    return inflation
+
+
+def _sector_scores(problem: _Problem, x: FloatArray, active: BoolArray, width: FloatArray) -> FloatArray:
+    """Sums (sectors, d) of the beams' scores at x (10,): derivatives by the active parameters, of `width` (d,)."""
+    step = 0.1 * width
+    ends = np.concatenate([np.diag(step), -np.diag(step)])
+    data = _sorted(problem.beams, problem.stretch, problem.reach, problem.straight)
+    terms = _log_terms(_completed(x[active] + ends, active, x), data, problem.inside, problem.dropout)
+    scores = (terms[: len(step)] - terms[len(step) :]) / (2.0 * step[:, None])
+    if problem.straight:
+        along = data.place[:, 1] / problem.reach
+    else:
+        along = np.arctan2(*(data.place - x[:2]).T) * (_SECTORS / (2.0 * np.pi))
+    _, sector = np.unique(np.floor(along), return_inverse=True)
+    sums = np.zeros((int(sector.max()) + 1, len(step)))
+    np.add.at(sums, sector, scores.T)
+    return sums
+
+
+def _sharpened(
     problem: _Problem, walkers: FloatArray, active: BoolArray, usual: FloatArray, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Walkers for the kind of spot that explains the beams best, and the usual parameters with its evenness."""
-    best = -np.inf
-    chosen, kind = walkers, usual
-    for evenness in (0.0, 0.5, 1.0):
-        trial = usual.copy()
-        trial[8] = evenness
-        density = _posterior(problem, active, trial)
-        # The second and third kind start from the top of the best before, with the walkers about it.
-        top, value, covariance = climb(density, np.vstack([walkers, chosen]))
-        if value > best:
-            best, kind = value, trial
-            chosen = scatter_about(density, top, value, covariance, walkers, rng)
-    return chosen, kind
+) -> tuple[_Problem, FloatArray, FloatArray]:
+    """The problem with the beams that matter, walkers about its top, and the usual parameters with the kind of spot.
+
+    The kind of spot is the one that explains the beams best.
+    """
+    kinds: tuple[float, ...] = _KINDS
+    for blur in _blurs(problem.beams):
+        tops: list[tuple[float, float, FloatArray]] = []
+        starts = walkers
+        for kind in kinds if blur < _KINDS_BLUR else (usual[8],):
+            trial = usual.copy()
+            trial[8] = kind
+            density = _posterior(problem.blurred(blur), active, trial)
+            # From a soft spot to one with a sharp end, each from the tops of those before: the other way is rugged.
+            top, value, covariance = climb(density, starts)
+            starts = np.vstack([starts, top + _RESCALED[:, active]])
+            tops.append((value, kind, scatter_about(density, top, value, covariance, walkers, rng)))
+        best, usual[8], walkers = max(tops, key=lambda entry: entry[0])
+        if len(tops) > 1:
+            kinds = tuple(kind for value, kind, _ in tops if value > best - _HOPELESS)
+        # Beams far from the edge, in widths of the spot, say nothing more.
+        full = _completed(walkers, active, usual)
+        width = 6.0 * float(np.exp(full[:, 3].max())) * problem.stretch + 0.5 * problem.reach
+        problem = problem.near(full[:, :3].mean(axis=0), width)
+    return problem, walkers, usual
+
+
+def _blurs(beams: EdgeBeams) -> list[float]:
+    """Ever smaller noise of depths to add to their own, and none in the end."""
+    own = float(np.median(beams.depth_sigma[:, 0])) if np.any(~beams.open) else _BLUR
+    blurs: list[float] = []
+    while (_BLUR * _SHARPEN ** len(blurs)) > own:
+        blurs.append(_BLUR * _SHARPEN ** len(blurs))
+    return [*blurs, 0.0]
 
 
 def _completed(x: FloatArray, active: BoolArray, usual: FloatArray) -> FloatArray:
-    """Parameters (k, 9) from the active ones (k, d)."""
+    """Parameters (k, 10) from the active ones (k, d)."""
     full = np.repeat(usual[None], len(x), axis=0)
     full[:, active] = x
     return full
@@ -384,9 +502,8 @@ def _posterior(problem: _Problem, active: BoolArray, usual: FloatArray) -> LogDe
 
     def density(some: FloatArray) -> FloatArray:
         x = _completed(some, active, usual)
-        ok = ((x[:, [5, 8]] >= 0.0) & (x[:, [5, 8]] <= 1.0)).all(axis=1)
         shape = problem.shape_prior(x)
-        ok &= np.isfinite(shape)
+        ok = np.isfinite(shape)
         value = np.full(len(x), -np.inf)
         if ok.any():
             prior = -0.5 * ((x[ok, 3] - np.log(_USUAL_SPOT_M)) / _SPOT_SPREAD) ** 2
@@ -394,20 +511,22 @@ def _posterior(problem: _Problem, active: BoolArray, usual: FloatArray) -> LogDe
             beyond = np.maximum(low - x[ok, 3:5], 0.0) + np.maximum(x[ok, 3:5] - high, 0.0)
             prior -= 0.5 * ((beyond / _WALL) ** 2).sum(axis=1)
             prior -= 0.5 * x[ok, 6] ** 2 + 0.5 * (x[ok, 7] / _CONTRAST_SIGMA) ** 2
+            share = _logistic(x[ok][:, [5, 9]])
+            prior += np.log(share * (1.0 - share) + 1e-300).sum(axis=1)
             # Far trials of a search may overflow; what is no number is no likelihood.
             with np.errstate(all="ignore"):
-                value[ok] = _log_likelihood(x[ok], data, problem.inside, problem.dropout) + prior + shape[ok]
+                value[ok] = _log_terms(x[ok], data, problem.inside, problem.dropout).sum(axis=1)
+                value[ok] += prior + shape[ok]
         return np.where(np.isnan(value), -np.inf, value)
 
     return density
 
 
 def _start(shape: FloatArray, off: FloatArray, reach: float, rng: np.random.Generator) -> FloatArray:
-    """Walkers (k, 9) spread by `off` (3,) about a first estimate of the shape (3,), and over all else."""
-    middle = np.concatenate([shape, [np.log(0.4 * reach), np.log(0.03), 0.3, 0.0, 0.0, 0.5]])
-    spread = np.concatenate([off, [0.5, 1.5, 0.15, 0.5, 0.3, 0.2]])
-    walkers = middle + spread * rng.normal(size=(WALKERS, 9))
-    walkers[:, [5, 8]] = np.clip(walkers[:, [5, 8]], 0.01, 0.99)
+    """Walkers (k, 10) spread by `off` (3,) about a first estimate of the shape (3,), and over all else."""
+    middle = np.concatenate([shape, [np.log(0.4 * reach), np.log(0.03), -1.0, 0.0, 0.0, 0.5, -3.0]])
+    spread = np.concatenate([off, [0.5, 1.5, 0.7, 0.5, 0.3, 0.2, 1.0]])
+    walkers = middle + spread * rng.normal(size=(WALKERS, 10))
     walkers[:, 3] = np.clip(walkers[:, 3], np.log(1.2 * SMALLEST_SPOT_M), np.log(0.8 * LARGEST_SPOT_M))
     walkers[:, 4] = np.clip(walkers[:, 4], np.log(2.0 * _SMALLEST_SCATTER), np.log(0.8 * _LARGEST_SCATTER))
     return walkers
