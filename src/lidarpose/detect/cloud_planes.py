@@ -39,7 +39,7 @@ MIN_GAP_M = 0.04
 # Of the voxels within twice a patch's thickness, the share that lies within it; and its thickness over its width.
 STANDS_OUT = 0.7
 THIN = 0.15
-EVIDENCE_POINTS = 20_000
+EVIDENCE_POINTS = 60_000
 # The second screening: neighbours that make a point's own normal, points asked, and how many have to agree how well.
 SCREENING_NEIGHBOURS = 12
 SCREENING_WIDTH = 1.5
@@ -47,6 +47,7 @@ LINED_UP = 0.15
 SCREENED_POINTS = 200
 SCREENING_RAD = np.radians(25.0)
 SCREENED_SHARE = 0.55
+ASKED_SHARE = 0.35
 # Sine of the angle below which a surface counts as seen edge-on.
 EDGE_ON = 0.06
 
@@ -356,7 +357,7 @@ def _stands_out(local: Float32Array, normal: FloatArray, offset: float, sigma_m:
 def _neighbours_agree(points: Float32Array, normal: FloatArray, sigma_m: float) -> bool:
     """The corner paper's second screening, of a whole patch: whether the normals that points (V, 3) have by their own
     neighbours are mostly the plane's. Neighbours along one scan line, no wider than the noise, have no normal; where
-    most are such, nobody is asked."""
+    two thirds are such, nobody is asked."""
     from scipy.spatial import cKDTree
 
     if len(points) <= SCREENING_NEIGHBOURS:
@@ -367,7 +368,7 @@ def _neighbours_agree(points: Float32Array, normal: FloatArray, sigma_m: float) 
     d = around - around.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", d, d, optimize=False) / SCREENING_NEIGHBOURS)
     known = (values[:, 1] > (SCREENING_WIDTH * sigma_m) ** 2) & (values[:, 1] > LINED_UP * values[:, 2])
-    if np.count_nonzero(known) < 0.5 * len(known):
+    if np.count_nonzero(known) < ASKED_SHARE * len(known):
         return True
     agree = np.abs(vectors[known, :, 0] @ normal) > np.cos(SCREENING_RAD)
     return bool(np.count_nonzero(agree) >= SCREENED_SHARE * len(agree))
