@@ -20,7 +20,8 @@ from lidarpose.model.sense import StatedSense
 from lidarpose.model.session import TurntablePlace, TurntableSession
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_run import Deviation, FunctionDeviation, Method, TruthError, TurntableRun
-from lidarpose.workflows.reversed_scans import describe_reversed, doubt_reversed, reversed_part, reversed_scans
+from lidarpose.workflows.named_causes import with_cause_named
+from lidarpose.workflows.reversed_scans import Solved, doubt_reversed, reversed_part, reversed_scans
 from lidarpose.workflows.turning_sense import check_sense, compared, turning_sense
 
 if TYPE_CHECKING:
@@ -103,7 +104,8 @@ def calibrate_turntable(
     try:
         observations, stripe_pairs = assign_lines(session, features, first_panel=first_panel)
     except UndeterminedError as error:
-        raise _with_reversed_named(error, session, features, first_panel) from None
+        tried = _parts(session, features, first_panel)
+        raise with_cause_named(error, session, features.places, features.left_out, *tried) from None
     estimate = None
     samples: Mapping[str, Pose] = {}
     if method == "joint" and not any(place.stripes for place in observations.places):
@@ -156,38 +158,35 @@ def checked(
     known = {name: [p for p in found if p is not None] for name, found in panel_poses.items()}
     found = reversed_scans(session, calibration.motion, known, suspects)
     if not found and quality is not None and quality.verdict == "rejected":
-        found = _reversed_part(session, features, None)
+        found = _reversed_part(session, features)
     quality = doubt_reversed(quality, found)
     readings = [place.turntable_angle_rad for place in session.places]
     return compared(quality, check_sense(calibration.motion, readings, stated))
 
 
-def _reversed_part(session: TurntableSession, features: DetectedFeatures, first_panel: int | None) -> tuple[str, ...]:
-    """Scans that run the other way round in a session that has no solution as a whole."""
+def _parts(
+    session: TurntableSession, features: DetectedFeatures, first_panel: int | None
+) -> tuple[Callable[[Sequence[PlaceFeatures]], TurntableObservations], Callable[[Sequence[PlaceFeatures]], Solved]]:
+    """Assignment and closed form of some of a session's places."""
 
-    def solve_part(positions: Sequence[str]) -> tuple[TurntableMotion, Mapping[str, Sequence[Pose]]]:
-        part = replace(features, places=tuple(p for p in features.places if p.position in positions))
-        observations, stripe_pairs = assign_lines(session, part, first_panel=first_panel)
-        paper = solve(observations, stripe_pairs)
+    def assign_part(places: Sequence[PlaceFeatures]) -> TurntableObservations:
+        return assign_lines(session, replace(features, places=tuple(places)), first_panel=first_panel)[0]
+
+    def solve_part(places: Sequence[PlaceFeatures]) -> Solved:
+        part = replace(features, places=tuple(places))
+        paper = solve(*assign_lines(session, part, first_panel=first_panel))
         return paper.motion, {n: [p.T_camera_panel for p in found] for n, found in paper.panel_poses.items()}
 
+    return assign_part, solve_part
+
+
+def _reversed_part(session: TurntableSession, features: DetectedFeatures) -> tuple[str, ...]:
+    """Scans that run the other way round in a session that has no sound solution as a whole."""
     if not any(place.stripes for place in features.places):
         return ()
-    return reversed_part(session, [place.position for place in features.places], solve_part)
-
-
-def _with_reversed_named(
-    error: UndeterminedError, session: TurntableSession, features: DetectedFeatures, first_panel: int | None
-) -> UndeterminedError:
-    """The error, or the one that names the scans whose reversal causes it."""
-    found = _reversed_part(session, features, first_panel)
-    if not found:
-        return error
-    return UndeterminedError(
-        f"The scans contradict each other: {describe_reversed(found)}",
-        remedy="Mend these files (negate their beam angles, or reverse their ranges) and calibrate again",
-        details=(error.what,),
-    )
+    _, solve_part = _parts(session, features, None)
+    by_name = {place.position: place for place in features.places}
+    return reversed_part(session, list(by_name), lambda names: solve_part([by_name[name] for name in names]))
 
 
 def doubted(quality: Quality | None, features: DetectedFeatures, observations: TurntableObservations) -> Quality | None:

@@ -1,0 +1,120 @@
+"""What may be wrong with a session in which no scan line finds its panel: the usual mistakes, tried one at a time.
+
+A session that is refused because nothing fits is of little help to the person who recorded it. Units, a table that did
+not turn, readings in another unit and scans in reverse each leave a mark of their own, and the one that explains the
+session is named.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lidarpose.errors import UndeterminedError
+from lidarpose.model.observation import LeftOut, PlaceFeatures, TurntableObservations
+from lidarpose.model.session import TurntableSession
+from lidarpose.workflows.reversed_scans import Solved, describe_reversed, reversed_part
+
+Places = Sequence[PlaceFeatures]
+
+_STILL_PX = 1.0
+_TURNED_RAD = np.deg2rad(0.5)
+_MOST_USED = 0.7
+_RANGES = ((1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"), (0.3048, "feet"))
+_READINGS = (
+    (2.0, "half of what they should be"),
+    (0.5, "twice what they should be"),
+    (180.0 / np.pi, "radians, not degrees"),
+    (np.pi / 180.0, "degrees that were turned into degrees once more"),
+    (10.0, "a tenth of what they should be"),
+    (0.1, "ten times what they should be"),
+)
+
+
+def with_cause_named(
+    error: UndeterminedError,
+    session: TurntableSession,
+    places: Places,
+    left_out: Sequence[LeftOut],
+    assign: Callable[[Places], TurntableObservations],
+    solve: Callable[[Places], Solved],
+) -> UndeterminedError:
+    """The error, or one that names its cause.
+
+    Parameters
+    ----------
+    places, left_out
+        What detection found, and what it gave up.
+    assign, solve
+        Scan lines to panels, and the closed form, of some places as they are given; both may raise UndeterminedError.
+    """
+    if not places and left_out:
+        often, count = Counter(item.reason for item in left_out).most_common(1)[0]
+        return UndeterminedError(f"No place can be used: {often} ({count} times)", remedy=error.remedy)
+    cause = _cause(session, places, assign, solve)
+    if cause is None:
+        return error
+    what, remedy = cause
+    return UndeterminedError(what, remedy=remedy, details=(error.what,))
+
+
+def _cause(
+    session: TurntableSession,
+    places: Places,
+    assign: Callable[[Places], TurntableObservations],
+    solve: Callable[[Places], Solved],
+) -> tuple[str, str] | None:
+    if not any(place.stripes for place in places):
+        return None
+    if stands_still(places):
+        return (
+            "The turntable did not turn: readings differ, but the stripe stays where it is in the image",
+            "Check that the table moves and that each row of positions.csv names its own image and scan",
+        )
+    for factor, unit in _RANGES:
+        if _fits([_scaled(place, factor) for place in places], assign):
+            return f"The ranges are in {unit}: so taken, the scans fit", "Write the scans in metres"
+    for factor, words in _READINGS:
+        turned = [replace(p, turntable_angle_rad=factor * p.turntable_angle_rad) for p in places]
+        if _fits(turned, assign):
+            return (
+                f"The turntable's readings are {words}: multiplied by {factor:.4g} they fit",
+                "Write the true readings in degrees into positions.csv",
+            )
+    by_name = {place.position: place for place in places}
+    reverse = reversed_part(session, list(by_name), lambda names: solve([by_name[name] for name in names]))
+    if reverse:
+        return (
+            f"The scans contradict each other: {describe_reversed(reverse)}",
+            "Mend these files (negate their beam angles, or reverse their ranges) and calibrate again",
+        )
+    return None
+
+
+def stands_still(places: Places) -> bool:
+    """Whether all stripes lie at the same place although the readings differ."""
+    lit = [place for place in places if place.stripes]
+    if len(lit) < 2 or np.ptp([place.turntable_angle_rad for place in lit]) < _TURNED_RAD:
+        return False
+    for panel in {k for place in lit for k in place.stripes}:
+        middles = np.array([np.median(p.stripes[panel].pixels, axis=0) for p in lit if panel in p.stripes])
+        if np.ptp(middles, axis=0).max() > _STILL_PX:
+            return False
+    return True
+
+
+def _fits(places: Places, assign: Callable[[Places], TurntableObservations]) -> bool:
+    """Whether most places find their scan lines."""
+    try:
+        found = assign(places)
+    except UndeterminedError:
+        return False
+    return len(found.places) >= max(3.0, _MOST_USED * len(places))
+
+
+def _scaled(place: PlaceFeatures, factor: float) -> PlaceFeatures:
+    lines = tuple(replace(s, range_m=factor * s.range_m, sigma_m=factor * s.sigma_m) for s in place.lines)
+    return replace(place, lines=lines)

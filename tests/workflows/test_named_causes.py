@@ -1,0 +1,28 @@
+"""Sessions in which nothing fits: the message names the mistake, not only that there is one."""
+
+import pytest
+
+from lidarpose.errors import UndeterminedError
+from lidarpose.simulate.corruption import Mistake, corrupt
+from lidarpose.simulate.rig import draw_rig
+from lidarpose.simulate.session import SimulatedSession, simulate_session
+from lidarpose.workflows.turntable import calibrate_turntable
+
+
+@pytest.fixture(scope="module")
+def simulated() -> SimulatedSession:
+    return simulate_session(draw_rig(5, family="mixed", places=7))
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        ("millimetre-scans", "ranges are in millimetres"),
+        ("turntable-stands-still", "did not turn"),
+        ("turntable-steps-twice-as-far", "half of what they should be"),
+        ("empty-scans", "no beam of its scan has a return"),
+    ],
+)
+def test_the_mistake_is_named(simulated: SimulatedSession, mistake: Mistake, words: str) -> None:
+    with pytest.raises(UndeterminedError, match=words):
+        calibrate_turntable(corrupt(simulated, mistake))
