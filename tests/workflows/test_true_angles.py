@@ -1,11 +1,13 @@
 """Readings that are off by a factor: clouds, beams and files take them as the calibration says."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lidarpose.errors import InputError
 from lidarpose.geometry.se3 import Pose, exp_so3
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.recording import SweepRecording
@@ -57,3 +59,15 @@ def test_the_derivatives_are_those_of_the_scaled_motion() -> None:
     numeric = (more.pose(2.0).minus(SCALED.pose(2.0)) - less.pose(2.0).minus(SCALED.pose(2.0))) / (2.0 * h)
     np.testing.assert_allclose(SCALED.pose_by_scale(2.0), numeric, atol=1e-8)
     np.testing.assert_allclose(SCALED.pose_jacobian(2.0), PLAIN.pose_jacobian(SCALED.true_angle(2.0)))
+
+
+@pytest.mark.parametrize(
+    "readings", ['{"scale": 0, "origin_rad": 0}', '{"scale": 1.01}', '{"scale": 1, "origin_rad": 1e99}']
+)
+def test_a_factor_that_cannot_be_is_refused(tmp_path: Path, readings: str) -> None:
+    write_calibration(tmp_path / "c.json", TurntableCalibration(SCALED))
+    document = json.loads((tmp_path / "c.json").read_text())
+    document["readings"] = json.loads(readings)
+    (tmp_path / "c.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="readings"):
+        read_turntable_calibration(tmp_path / "c.json")

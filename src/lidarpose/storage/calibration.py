@@ -48,8 +48,8 @@ class _ParametersEntry(_Lenient):
 
 
 class _ReadingsEntry(_Lenient):
-    scale: Annotated[float, Field(gt=0.0)]
-    origin_rad: float
+    scale: Annotated[float, Field(ge=0.01, le=100.0)]
+    origin_rad: Annotated[float, Field(ge=-1e4, le=1e4)]
 
 
 class _QualityEntry(_Lenient):
