@@ -7,7 +7,7 @@ BENCH_VENV := .venv-bench
 BENCH_STAMP := $(BENCH_VENV)/.installed
 BENCH_PYTHON = $(if $(wildcard $(BENCH_STAMP)),$(BENCH_VENV),$(VENV))/bin/python
 
-.PHONY: setup demo test test-slow check format lock gallery bench bench-compare bench-quick bench-setup accuracy accuracy-world clean
+.PHONY: setup demo test test-slow fuzz fuzz-figures check format lock gallery bench bench-compare bench-quick bench-setup accuracy accuracy-world clean
 
 setup: $(STAMP)
 
@@ -36,6 +36,21 @@ test-slow: setup
 # The corner paper's tables again; an hour on two cores.
 accuracy-world: setup
 	$(BIN)/python benchmarks/accuracy_world.py --output docs/accuracy-world.md
+
+# Damaged files for every reader, guided by coverage, for FUZZ_SECONDS or a little more. atheris lies in a folder of its
+# own, as it has no wheel for every Python and system; where it has none, this says so and does nothing.
+FUZZ_SECONDS ?= 75
+FUZZ_PACKAGES := $(VENV)/fuzz
+fuzz: setup
+	-test -d $(FUZZ_PACKAGES)/atheris || $(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes \
+	  --only-binary :all: --target $(FUZZ_PACKAGES) --requirement tests/fuzz-requirements.lock
+	cd tests && PYTHONPATH=$(abspath $(FUZZ_PACKAGES)) $(abspath $(BIN))/python -m tests_support.atheris_job --seconds $(FUZZ_SECONDS)
+
+# The figures of docs/formats.md again; half an hour.
+fuzz-figures: fuzz
+	cd tests && $(abspath $(BIN))/python -W ignore -m tests_support.bad_bytes --runs 500 --write ../docs/formats.md
+	cd tests && PYTHONPATH=$(abspath $(FUZZ_PACKAGES)) $(abspath $(BIN))/python -m tests_support.atheris_job --seconds 300 \
+	  --write ../docs/formats.md
 
 format: setup
 	$(BIN)/ruff check --fix src tests benchmarks

@@ -355,9 +355,11 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="")
+    parser.add_argument("--write", type=Path, help="put the figures into this page, between its marks")
     options = parser.parse_args()
     bad = 0
     total = 0
+    table = []
     with tempfile.TemporaryDirectory() as folder:
         for index, reader in enumerate(reader for reader in READERS if options.only in reader.name):
             report = Path(folder) / f"{index}.json"
@@ -378,13 +380,36 @@ def main() -> int:
             bad += found["bad"]
             total += options.runs
             line = f"{found['data']:6} data {found['refused']:6} refused {found['bad']:4} bad"
+            table.append((reader.name, found["data"], found["refused"], found["bad"], found["slowest_s"]))
             print(f"{reader.name:24} {line}, slowest {found['slowest_s']:.2f} s", flush=True)
             for problem in found["problems"]:
                 print("    " + problem.replace("\n", "\n    "))
             for slow in Path(folder).glob("*.slow"):
                 slow.rename(Path(tempfile.gettempdir()) / f"slow-{reader.name.replace(' ', '-')}")
     print(f"{total} runs, {bad} bad")
+    if options.write is not None:
+        write_figures(options.write, "bad_bytes", _figures(table, total, bad))
     return bad > 0
+
+
+def _figures(table: list[tuple[str, int, int, int, float]], total: int, bad: int) -> str:
+    rows = [
+        f"| {name} | {data} | {refused} | {wrong} | {slowest:.2f} |" for name, data, refused, wrong, slowest in table
+    ]
+    head = ["| reader | data | refused | anything else | slowest s |", "|---|---|---|---|---|"]
+    summary = (
+        f"{total} damaged files; {bad} times anything else than data or one `InputError`, or beyond 2 s or 512 MB."
+    )
+    return "\n".join([summary, "", *head, *rows])
+
+
+def write_figures(page: Path, name: str, text: str) -> None:
+    """Put a text between the marks `<!-- NAME -->` and `<!-- /NAME -->` of a page."""
+    before, mark, rest = page.read_text(encoding="utf-8").partition(f"<!-- {name} -->\n")
+    _, end, after = rest.partition(f"<!-- /{name} -->")
+    if not (mark and end):
+        raise SystemExit(f"{page} has no marks for {name}")
+    page.write_text(f"{before}{mark}{text}\n{end}{after}", encoding="utf-8")
 
 
 if __name__ == "__main__":
