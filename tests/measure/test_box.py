@@ -1,6 +1,7 @@
 """A carton's edges and planes against the truth."""
 
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,8 @@ import pytest
 from lidarpose.cli.main import run
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.se3 import Pose, exp_so3, nearest_rotation
-from lidarpose.measure.beams import beams_of
-from lidarpose.measure.box import measure_box
+from lidarpose.measure.beams import Beams, beams_of, chosen_beams
+from lidarpose.measure.box import BoxMeasurement, edge_lengths, measure_box, with_calibration
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.recording import SweepRecording
 from lidarpose.simulate.disk_scene import rig_motion
@@ -53,6 +54,49 @@ def test_edges_of_a_carton(floor: bool) -> None:
     assert len(box.face_points) == 3
     np.testing.assert_allclose(box.angles_deg, 90.0, atol=0.1)
     assert ("face", "support") in [e.by for e in box.edges] or not floor
+
+
+@cache
+def carton_and_box() -> tuple[SweepRecording, BoxMeasurement]:
+    recording = carton(floor=True)
+    return recording, measure_box(beams_of(recording, MOTION), 0.001)
+
+
+def test_the_calibrations_share_is_that_of_sampled_calibrations() -> None:
+    recording, box = carton_and_box()
+    # The radius and the mounting, badly known: what distorts sizes.
+    root = np.diag([1e-3] * 3 + [1e-3] * 3 + [2e-3] + [4e-3] * 3)
+
+    def moved(change: np.ndarray, index: np.ndarray) -> Beams:
+        return chosen_beams(recording, MOTION, index, change)
+
+    stated = with_calibration(box, moved, root @ root.T)
+    draws = np.random.default_rng(0).normal(size=(60, 10))
+    draws -= draws.mean(axis=0)
+    draws = draws @ np.linalg.inv(np.linalg.cholesky(np.cov(draws.T))).T  # their own covariance is exactly one
+    lengths = [edge_lengths(box, moved, root @ draw) for draw in draws]
+    shares = [e.calibration_sigma_m for e in stated.edges]
+    np.testing.assert_allclose(shares, np.std(lengths, axis=0, ddof=1), rtol=0.05)
+    assert all(e.sigma_m > e.beams_sigma_m for e in stated.edges)
+
+
+def test_the_calibrations_share_against_measuring_anew() -> None:
+    """The whole measurement again with a calibration that is a little off."""
+    recording, box = carton_and_box()
+    change = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 4e-3, 0.01, -0.008, 0.01])
+    index = np.arange(recording.range_m.size)
+    grid = chosen_beams(recording, MOTION, index, change)
+    shape = recording.range_m.shape
+    off = Beams(grid.origin.reshape(*shape, 3), grid.direction.reshape(*shape, 3), grid.range_m.reshape(shape))
+    anew = [e.length_m for e in measure_box(off, 0.001).edges]
+
+    def moved(change: np.ndarray, index: np.ndarray) -> Beams:
+        return chosen_beams(recording, MOTION, index, change)
+
+    expected = edge_lengths(box, moved, change) - edge_lengths(box, moved, np.zeros(10))
+    found = np.array(anew) - [e.length_m for e in box.edges]
+    assert np.abs(expected).max() > 2e-4
+    np.testing.assert_allclose(found, expected, atol=1.5e-4)
 
 
 def test_a_room_corner_is_no_box() -> None:

@@ -39,13 +39,14 @@ def measure_box(
     view = measurement_view(source, calibration, never_stops)
     box = measure(view)
     remarks = [*view.remarks]
-    if view.covariance is not None:
-        remarks.append("sigma_mm holds the beams and the planes; the calibration's share is not included")
     if json:
         print_json(
             {
                 "edges_mm": [1e3 * e.length_m for e in box.edges],
                 "sigma_mm": [1e3 * e.sigma_m for e in box.edges],
+                "calibration_sigma_mm": [
+                    None if e.calibration_sigma_m is None else 1e3 * e.calibration_sigma_m for e in box.edges
+                ],
                 "directions": [e.direction.tolist() for e in box.edges],
                 "ends": [list(e.by) for e in box.edges],
                 "face_normals": box.face_normals.tolist(),

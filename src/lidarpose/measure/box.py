@@ -7,15 +7,17 @@ the box stands on or leans against.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from scipy import ndimage
 
 from lidarpose.errors import UndeterminedError
-from lidarpose.geometry.arrays import BoolArray, FloatArray, unit
-from lidarpose.measure.beams import Beams
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, unit
+from lidarpose.geometry.planes import Plane
+from lidarpose.measure.beams import Beams, fit_plane_to_ranges, plane_ranges
 from lidarpose.measure.edge_beams import WIDEST_SPOT_M, PlaneView, edge_beams, view_of_patch
 from lidarpose.measure.edge_model import fit_straight_edge
 from lidarpose.measure.outline import in_plane
@@ -27,23 +29,59 @@ _LARGEST_FACE_M = 5.0
 
 
 @dataclass(frozen=True, eq=False)
+class FaceSupport:
+    """A plane, the beams behind it as flat indices into the grid; `sign` times its normal points out of the box."""
+
+    plane: Plane
+    sign: float
+    index: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class EndSupport:
+    """What ends an edge: a plane (at `beside`, a face along the edge, if the plane is no face of the box), or borders.
+
+    A border is a face, the beams at its border, and its weight.
+    """
+
+    face: FaceSupport | None
+    beside: FaceSupport | None = None
+    borders: tuple[tuple[FaceSupport, IntArray, float], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class BoxEdge:
     """One of the three lengths of a box.
 
     Attributes
     ----------
-    length_m, sigma_m
-        The length and its standard deviation (without the calibration's share).
+    length_m
+        The length.
+    beams_sigma_m
+        Its standard deviation from the planes and the borders.
+    calibration_sigma_m
+        From the calibration's covariance; None where it carries none.
     direction : (3,)
         Along the edge, outward at its end nearer to a visible face.
     by
         What bounds it at both ends: "face", "border" or "support" (the plane it stands on).
+    axis, ends
+        What is needed to see how the calibration moves the answer: the faces that give the direction (their normals'
+        product, if two), and what bounds both ends.
     """
 
     length_m: float
-    sigma_m: float
+    beams_sigma_m: float
+    calibration_sigma_m: float | None
     direction: FloatArray
     by: tuple[str, str]
+    axis: tuple[FaceSupport, ...]
+    ends: tuple[EndSupport, EndSupport]
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the length, the calibration's share included where it is known."""
+        return float(np.hypot(self.beams_sigma_m, self.calibration_sigma_m or 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +109,13 @@ class _Face:
     middle: FloatArray
     places: FloatArray
 
+    @property
+    def support(self) -> FaceSupport:
+        """The plane and at most 1500 of its beams."""
+        index = self.view.index[self.view.plane_used]
+        sign = 1.0 if float(self.normal @ self.view.plane.normal) > 0.0 else -1.0
+        return FaceSupport(self.view.plane, sign, index[:: max(1, len(index) // 1500)])
+
 
 @dataclass(frozen=True)
 class _End:
@@ -79,6 +124,7 @@ class _End:
     position: float
     variance: float
     by: str
+    support: EndSupport
 
 
 def measure_box(beams: Beams, sigma: float, *, seed: int = 0) -> BoxMeasurement:
@@ -92,10 +138,10 @@ def measure_box(beams: Beams, sigma: float, *, seed: int = 0) -> BoxMeasurement:
     faces = [f for p in find_patches(beams.points, sigma) if (f := _face(beams, p, sigma)) is not None]
     chosen = _box_faces(faces, sigma)
     others = [f for f in faces if f not in chosen]
-    axes = [f.normal for f in chosen]
+    axes: list[tuple[FloatArray, tuple[FaceSupport, ...]]] = [(f.normal, (f.support,)) for f in chosen]
     if len(axes) == 2:
-        axes.append(unit(np.cross(axes[0], axes[1])))
-    edges = [_edge(axis, chosen, others, sigma, seed) for axis in axes]
+        axes.append((unit(np.cross(axes[0][0], axes[1][0])), (axes[0][1][0], axes[1][1][0])))
+    edges = [_edge(axis, given_by, chosen, others, sigma, seed) for axis, given_by in axes]
     edges.sort(key=lambda e: -e.length_m)
     angles = [float(np.rad2deg(np.arccos(np.clip(a.normal @ b.normal, -1.0, 1.0)))) for a, b in combinations(chosen, 2)]
     normals = np.stack([f.normal for f in chosen])
@@ -157,10 +203,24 @@ def _are_neighbours(a: _Face, b: _Face, sigma: float) -> bool:
     return bool(overlap > 0.5 * min(spans[0][1] - spans[0][0], spans[1][1] - spans[1][0]))
 
 
-def _edge(axis: FloatArray, faces: list[_Face], others: list[_Face], sigma: float, seed: int) -> BoxEdge:
-    ends = [_end(sign * axis, faces, others, sigma, seed) for sign in (1.0, -1.0)]
-    length = ends[0].position + ends[1].position
-    return BoxEdge(length, float(np.sqrt(ends[0].variance + ends[1].variance)), axis, (ends[0].by, ends[1].by))
+def _edge(
+    axis: FloatArray,
+    given_by: tuple[FaceSupport, ...],
+    faces: list[_Face],
+    others: list[_Face],
+    sigma: float,
+    seed: int,
+) -> BoxEdge:
+    first, second = (_end(sign * axis, faces, others, sigma, seed) for sign in (1.0, -1.0))
+    return BoxEdge(
+        first.position + second.position,
+        float(np.sqrt(first.variance + second.variance)),
+        None,
+        axis,
+        (first.by, second.by),
+        given_by,
+        (first.support, second.support),
+    )
 
 
 def _end(direction: FloatArray, faces: list[_Face], others: list[_Face], sigma: float, seed: int) -> _End:
@@ -169,14 +229,18 @@ def _end(direction: FloatArray, faces: list[_Face], others: list[_Face], sigma: 
     for face in faces:
         if float(face.normal @ direction) > 0.9:
             # The plane, taken where the other faces are.
-            return _End(face.offset, _plane_variance(face, np.mean([f.middle for f in along], axis=0)), "face")
+            variance = _plane_variance(face, np.mean([f.middle for f in along], axis=0))
+            return _End(face.offset, variance, "face", EndSupport(face.support))
     borders = [b for f in along if (b := _border(f, direction, sigma, seed)) is not None]
     if borders:
         weights = np.array([1.0 / b.variance for b in borders])
         position = float(weights @ [b.position for b in borders] / weights.sum())
         chi2 = sum((b.position - position) ** 2 / b.variance for b in borders)
         # Two borders that disagree are both worse than they say.
-        return _End(position, max(1.0, chi2 / max(1, len(borders) - 1)) / float(weights.sum()), "border")
+        parts = [b.support.borders[0] for b in borders]
+        shares = tuple((part[0], part[1], float(w / weights.sum())) for part, w in zip(parts, weights, strict=True))
+        variance = max(1.0, chi2 / max(1, len(borders) - 1)) / float(weights.sum())
+        return _End(position, variance, "border", EndSupport(None, borders=shares))
     support = _support(direction, along, others)
     if support is not None:
         return support
@@ -215,7 +279,9 @@ def _border(face: _Face, direction: FloatArray, sigma: float, seed: int) -> _End
     # A plane that is off by a little moves the border of a face seen aslant along it.
     sight = face.view.beams.direction[near].mean(axis=0)
     slant = float(sight @ e) / float(sight @ face.normal)
-    return _End(float(border @ direction), variance + slant**2 * _plane_variance(face, border), "border")
+    variance += slant**2 * _plane_variance(face, border)
+    support = EndSupport(None, borders=((face.support, face.view.index[near], 1.0),))
+    return _End(float(border @ direction), variance, "border", support)
 
 
 def _support(direction: FloatArray, along: list[_Face], others: list[_Face]) -> _End | None:
@@ -232,7 +298,8 @@ def _support(direction: FloatArray, along: list[_Face], others: list[_Face]) -> 
             )
             gap = abs(position - last)
             if gap < 4.0 * face.view.step + 0.01 and (best is None or gap < best[0]):
-                best = gap, _End(position, _plane_variance(other, face.middle), "support")
+                support = EndSupport(other.support, face.support)
+                best = gap, _End(position, _plane_variance(other, face.middle), "support", support)
     return None if best is None else best[1]
 
 
@@ -241,3 +308,59 @@ def _plane_variance(face: _Face, point: FloatArray) -> float:
     local = (point - face.view.frame[0]) @ face.view.frame[1:].T
     J = np.array([local[0], local[1], 1.0])
     return float(J @ face.view.plane_covariance @ J)
+
+
+MovedBeams = Callable[[FloatArray, IntArray], Beams]
+
+
+def with_calibration(box: BoxMeasurement, moved: MovedBeams, covariance: FloatArray) -> BoxMeasurement:
+    """The measurement with the calibration's share of each length's standard deviation.
+
+    Parameters
+    ----------
+    moved
+        Gives the beams of flat indices under a small change (n,) of the calibration's parameters.
+    covariance : (n, n)
+        Of these parameters.
+    """
+    gradients = np.zeros((len(box.edges), len(covariance)))
+    for k in range(len(covariance)):
+        step = np.zeros(len(covariance))
+        step[k] = 1e-5
+        ends = [edge_lengths(box, moved, sign * step) for sign in (1.0, -1.0)]
+        gradients[:, k] = (ends[0] - ends[1]) / 2e-5
+    shares = np.sqrt(np.maximum(np.einsum("ek,kl,el->e", gradients, covariance, gradients), 0.0))
+    edges = tuple(replace(e, calibration_sigma_m=float(s)) for e, s in zip(box.edges, shares, strict=True))
+    return replace(box, edges=edges)
+
+
+def edge_lengths(box: BoxMeasurement, moved: MovedBeams, change: FloatArray) -> FloatArray:
+    """The edges' lengths, each up to a constant, under a change (n,): planes refitted, borders moved along."""
+    fits: dict[int, Plane] = {}
+
+    def plane(face: FaceSupport) -> Plane:
+        key = int(face.index[0])
+        if key not in fits:
+            fits[key] = fit_plane_to_ranges(face.plane, moved(change, face.index), np.inf)[0]
+        return fits[key]
+
+    def middle(face: FaceSupport, index: IntArray) -> FloatArray:
+        beams = moved(change, index)
+        return np.asarray((beams.origin + plane_ranges(plane(face), beams)[:, None] * beams.direction).mean(axis=0))
+
+    def position(end: EndSupport, direction: FloatArray) -> float:
+        if end.face is None:
+            return float(sum(w * (middle(face, index) @ direction) for face, index, w in end.borders))
+        found = plane(end.face)
+        if end.beside is None:
+            return end.face.sign * found.offset
+        start = middle(end.beside, end.beside.index)
+        gap = (found.offset - float(found.normal @ start)) / float(found.normal @ direction)
+        return float(start @ direction) + gap
+
+    lengths = []
+    for edge in box.edges:
+        normals = [face.sign * plane(face).normal for face in edge.axis]
+        axis = normals[0] if len(normals) == 1 else unit(np.cross(normals[0], normals[1]))
+        lengths.append(position(edge.ends[0], axis) + position(edge.ends[1], -axis))
+    return np.array(lengths)

@@ -14,6 +14,7 @@ from lidarpose.measure.assemble import readings_between
 from lidarpose.measure.beams import Beams, beams_of, chosen_beams, range_noise
 from lidarpose.measure.box import BoxMeasurement
 from lidarpose.measure.box import measure_box as measure_box_of
+from lidarpose.measure.box import with_calibration as box_with_calibration
 from lidarpose.measure.cloud_beams import beams_of_cells, beams_of_rings, recording_from_cloud
 from lidarpose.measure.disk import RoundMeasurement, measure_round, with_calibration
 from lidarpose.measure.outline import Kind, nothing_round
@@ -136,7 +137,10 @@ def measure_box(view: MeasuringView, *, seed: int = 0) -> BoxMeasurement:
     UndeterminedError
         If no box is found, or an end of an edge is not seen.
     """
-    return measure_box_of(view.beams, view.noise_m, seed=seed)
+    box = measure_box_of(view.beams, view.noise_m, seed=seed)
+    if view.covariance is None or view.moved is None:
+        return box
+    return box_with_calibration(box, view.moved, view.covariance)
 
 
 def measure_planes(view: MeasuringView, *, least_share: float = 0.002, seed: int = 0) -> list[MeasuredPlane]:
