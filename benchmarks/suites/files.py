@@ -27,7 +27,7 @@ class _Way:
 
 
 def run(effort: Effort) -> Report:
-    n = effort.pick(5_000_000, 500_000)
+    n = effort.pick(3_000_000, 500_000)
     points = np.random.default_rng(0).uniform(-20.0, 20.0, (n, 3)).astype(np.float32)
     with tempfile.TemporaryDirectory() as temporary:
         ways = _ways(Path(temporary), points)
@@ -35,8 +35,8 @@ def run(effort: Effort) -> Report:
             if way.write is not None:
                 way.write()
         repeats = effort.pick(5, 1)
-        writing = interleaved({k: w.write for k, w in ways.items() if w.write is not None}, repeats, budget_s=8.0)
-        reading = interleaved({k: w.read for k, w in ways.items() if w.read is not None}, repeats, budget_s=8.0)
+        writing = interleaved({k: w.write for k, w in ways.items() if w.write is not None}, repeats, budget_s=3.0)
+        reading = interleaved({k: w.read for k, w in ways.items() if w.read is not None}, repeats, budget_s=3.0)
     raw_write, raw_read = writing[RAW], reading[RAW]
     figures = {}
     for kind in ("pcd", "ply"):
