@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks.report import Curve
 from lidarpose.report.svg import Axis
 
-WIDTH, HEIGHT, LEFT, TOP, BOTTOM, LEGEND = 760, 380, 62, 18, 48, 250
+WIDTH, HEIGHT, LEFT, TOP, BOTTOM, LEGEND = 930, 380, 62, 18, 48, 420
 COLOURS = ("#0b6e4f", "#c8553d", "#3d5a98", "#b8860b", "#7a4e8a", "#5b7c85", "#9c3848", "#4d4d4d", "#88a04b")
+
+
+class _Pen(NamedTuple):
+    """How a line is drawn."""
+
+    colour: str
+    dash: str
 
 
 def svg(curve: Curve) -> str:
@@ -21,10 +29,13 @@ def svg(curve: Curve) -> str:
     y_axis = Axis(curve.y_label, float(values.min()) / 1.2, float(values.max()) * 1.2, log=True)
     parts = [_grid(x_axis, y_axis, curve.x)]
     for k, (name, series) in enumerate(curve.series.items()):
-        parts.append(_line(x_axis, y_axis, curve.x, series, COLOURS[k % len(COLOURS)]))
+        # A limit, not a contestant, is black and dashed.
+        limit = name.startswith("bound")
+        pen = _Pen("#222" if limit else COLOURS[k % len(COLOURS)], ' stroke-dasharray="5 3"' if limit else "")
+        parts.append(_line(x_axis, y_axis, curve.x, series, pen))
         y = TOP + 14 + 20 * k
         u = WIDTH - LEGEND + 16
-        parts.append(f'<path d="M{u} {y - 4}h20" stroke="{COLOURS[k % len(COLOURS)]}" stroke-width="2.2"/>')
+        parts.append(f'<path d="M{u} {y - 4}h20" stroke="{pen.colour}" stroke-width="2.2"{pen.dash}/>')
         parts.append(f'<text x="{u + 27}" y="{y}">{escape(name)}</text>')
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{HEIGHT}" viewBox="0 0 {WIDTH} {HEIGHT}" '
@@ -59,11 +70,12 @@ def _grid(x_axis: Axis, y_axis: Axis, x: Sequence[float]) -> str:
     return "".join(parts)
 
 
-def _line(x_axis: Axis, y_axis: Axis, x: Sequence[float], y: Sequence[float], colour: str) -> str:
+def _line(x_axis: Axis, y_axis: Axis, x: Sequence[float], y: Sequence[float], pen: _Pen) -> str:
     known = [(a, b) for a, b in zip(x, y, strict=True) if np.isfinite(b) and b > 0.0]
     if not known:
         return ""
     us, vs = _u(x_axis, [a for a, _ in known]), _v(y_axis, [b for _, b in known])
     path = "M" + "L".join(f"{u:.1f} {v:.1f}" for u, v in zip(us, vs, strict=True))
     marks = "".join(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="3"/>' for u, v in zip(us, vs, strict=True))
-    return f'<path d="{path}" fill="none" stroke="{colour}" stroke-width="2"/><g fill="{colour}">{marks}</g>'
+    line = f'<path d="{path}" fill="none" stroke="{pen.colour}" stroke-width="2"{pen.dash}/>'
+    return f'{line}<g fill="{pen.colour}">{marks}</g>'

@@ -28,7 +28,9 @@ def page(results: Mapping[str, Any]) -> str:
     """The whole page in Markdown."""
     machine = results["machine"]
     about = ", ".join(f"{name} {value}" for name, value in machine["versions"].items())
-    parts = [HEAD, f"{machine['cores']} cores; {about}." + (_QUICK if results["quick"] else ""), "", *_figures(results)]
+    warnings = (_QUICK if results["quick"] else "") + (_BUSY if machine["load"] > 0.5 * machine["cores"] else "")
+    parts = [HEAD, f"{machine['cores']} cores, load {machine['load']:g} before the first suite; {about}.{warnings}", ""]
+    parts += _figures(results)
     for suite in results["suites"].values():
         for table in suite["tables"]:
             parts += ["", f"## {table['title']}", "", *([table["text"], ""] if table["text"] else [])]
@@ -39,6 +41,7 @@ def page(results: Mapping[str, Any]) -> str:
     return "\n".join(parts).rstrip() + "\n"
 
 
+_BUSY = " **The machine was busy: no times to rely on, and ratios of times only roughly.**"
 _QUICK = " **A quick run: small sizes and few repeats, no figures to rely on.**"
 
 

@@ -11,13 +11,13 @@ from benchmarks.timing import exponent, interleaved
 from lidarpose.simulate.rig import draw_rig
 
 
-def results(value: float) -> dict[str, object]:
+def results(value: float, load: float = 0.1) -> dict[str, object]:
     report = Report(
         {"start.help_s": value},
         [Table("Starting", ["process", "s"], [["lidarpose", 0.1234], ["open3d", None]])],
         [Curve("drawn", "Drawn", "size", "s", [1.0, 10.0], {"ours": [0.1, 1.0], "theirs": [float("nan"), 3.0]})],
     )
-    machine = {"cores": 2, "versions": {"Python": "3.11"}}
+    machine = {"cores": 2, "load": load, "versions": {"Python": "3.11"}}
     return {"machine": machine, "quick": False, "suites": {"starting": report.as_json()}}
 
 
@@ -41,6 +41,11 @@ def test_the_page_says_what_was_met_missed_not_measured_and_not_installed() -> N
     assert "not measured" in met
     assert "| open3d | not installed |" in met
     assert "images/bench-drawn.svg" in met
+
+
+def test_a_busy_machine_is_told() -> None:
+    assert "The machine was busy" in page(results(0.1, load=7.0))
+    assert "busy" not in page(results(0.1))
 
 
 def test_two_runs_are_compared_within_the_tolerance() -> None:
