@@ -47,6 +47,11 @@ class Metric:
         return abs(first - second) <= self.tolerance * max(abs(first), abs(second))
 
 
+_PLANES = (
+    "In one thread three planes of 700 k points take 156 ms: 66 for refits on the full cloud, 69 for asking whether a "
+    "patch stands out from its surroundings, 12 for hypotheses. Open3D asks neither, and misses a face of 2 %."
+)
+
 METRICS: tuple[Metric, ...] = (
     # Starting
     Metric("start.import_s", "`import lidarpose`, warm", "s", 0.5, 0.15),
@@ -66,9 +71,17 @@ METRICS: tuple[Metric, ...] = (
     Metric("stripes.ms_per_megapixel", "the same a megapixel", "ms", 0.3),
     Metric("stripes.decoding", "a stripe image, over decoding it", "x", 0.3),
     # Planes
-    Metric("planes.open3d", "Open3D segment_plane at its defaults, 700 k points, over ours", "x", 0.4, 50.0, "higher"),
+    Metric(
+        "planes.open3d",
+        "Open3D segment_plane at its defaults, 700 k points, over ours",
+        "x",
+        0.4,
+        50.0,
+        "higher",
+        _PLANES,
+    ),
     Metric("planes.open3d_1000", "the same with 1000 iterations, over ours", "x", 0.4, None, "higher"),
-    Metric("planes.subsample", "Open3D on a random subsample of 20 k, over ours", "x", 0.4, 5.0, "higher"),
+    Metric("planes.subsample", "Open3D on a random subsample of 20 k, over ours", "x", 0.4, 5.0, "higher", _PLANES),
     Metric("planes.pyransac3d", "pyransac3d at its defaults, 700 k points, over ours", "x", 0.4, None, "higher"),
     Metric("planes.error", "normals' RMS error, over the best peer's, three like faces", "x", 0.5, 1.0),
     Metric("planes.error_small", "worst normal with a face of 2 % of the points, over the best peer's", "x", 0.5, 1.0),

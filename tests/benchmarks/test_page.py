@@ -44,7 +44,10 @@ def test_the_page_says_what_was_met_missed_not_measured_and_not_installed() -> N
 
 
 def test_a_busy_machine_is_told() -> None:
-    assert "The machine was busy" in page(results(0.1, load=7.0))
+    told = page(results(0.9, load=7.0))
+    assert "The machine was busy" in told
+    assert "| 0.9 s | at most 0.2 s | not judged |" in told
+    assert "**missed**" not in told
     assert "busy" not in page(results(0.1))
 
 
