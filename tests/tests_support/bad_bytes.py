@@ -19,12 +19,15 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from lidarpose.cli.main import run
 from lidarpose.errors import InputError, UndeterminedError
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.calibration import TurntableCalibration
@@ -191,6 +194,25 @@ def _corners(damaged: str) -> Callable[[Path], tuple[Path, Path]]:
     return make
 
 
+def _command(*words: str) -> Callable[[Path], object]:
+    """A whole command in this process, with `@` for the damaged folder: it ends with one of its own statuses."""
+
+    def run_it(target: Path) -> object:
+        with tempfile.TemporaryDirectory() as out, redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+            names = {"@": str(target), "OUT": f"{out}/out", "CLOUD": f"{out}/a.ply"}
+            names["CALIBRATION"] = str(target.parent / "c.json")
+            status = run([names.get(word, word) for word in words])
+        assert status in (0, 1, 2)
+        return status
+
+    return run_it
+
+
+def _recording_and_calibration(folder: Path) -> tuple[Path, Path]:
+    write_calibration(folder / "c.json", _calibration())
+    return _recording("range_m.npy")(folder)
+
+
 def _scene(folder: Path) -> tuple[Path, Path]:
     (folder / "scene.toml").write_text(SCENE)
     return folder / "scene.toml", folder / "scene.toml"
@@ -265,6 +287,10 @@ READERS = [
     Reader("session truth", _turntable("../session.truth.json"), load_turntable),
     *(Reader(f"corners {n}", _corners(n), load_corners) for n in ("session.toml", "positions.csv", "clouds/p0/0.pcd")),
     *(Reader(f"recording {n}", _recording(n), read_recording) for n in _RECORDING_FILES),
+    Reader("inspect positions.csv", _turntable("positions.csv"), _command("inspect", "@", "--quiet")),
+    Reader("calibrate scans/0.csv", _turntable("scans/0.csv"), _command("calibrate", "@", "-o", "OUT", "--quiet")),
+    Reader("calibrate clouds", _corners("clouds/p0/0.pcd"), _command("calibrate", "@", "-o", "OUT", "--quiet")),
+    Reader("scan", _recording_and_calibration, _command("scan", "@", "CALIBRATION", "-o", "CLOUD")),
     Reader("image", _png, lambda path: FileImage(path, "i.png", 64, 48).load()),
     Reader("packets", _pcap, lambda path: list(read_packets(path))),
 ]
