@@ -16,7 +16,7 @@ def run(effort: Effort) -> Report:
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session"
         simulate(session, effort.pick(PLACES, 12))
-        found = measure(session, effort.pick(7, 1))
+        found = measure(session, effort.pick(5, 1))
     decoding, plain, report, plain_command, command = found.values()
     figures = {
         "calibrate.report": report / decoding,

@@ -38,7 +38,7 @@ def run(effort: Effort) -> Report:
         sessions = {"places": turntable, "frames": world}
         # Sizes in turn, and all of them again: a slow minute falls on all alike.
         found: dict[tuple[str, int], list[dict[str, float]]] = {}
-        for _ in range(effort.pick(3, 1)):
+        for _ in range(effort.pick(2, 1)):
             for name, values in sizes.items():
                 for size in values:
                     one = in_child("benchmarks.growing", name, str(size), str(sessions.get(name, ".")))
