@@ -363,7 +363,7 @@ def _neighbours_agree(points: Float32Array, normal: FloatArray, sigma_m: float) 
     if len(points) <= SCREENING_NEIGHBOURS:
         return True
     seeds = points[:: max(len(points) // SCREENED_POINTS, 1)]
-    _, neighbours = cKDTree(points).query(seeds, k=SCREENING_NEIGHBOURS)
+    _, neighbours = cKDTree(points, compact_nodes=False, balanced_tree=False).query(seeds, k=SCREENING_NEIGHBOURS)
     around = points[neighbours].astype(np.float64)
     d = around - around.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", d, d, optimize=False) / SCREENING_NEIGHBOURS)
