@@ -27,6 +27,7 @@ MOVED_M = 0.15
 MAX_SEEDS = 4000
 # A target turned by more than this is not known again.
 MAX_TURN_RAD = np.radians(44.0)
+STRAY_SUPPORT = 40
 
 _ORDERS = np.array(list(permutations(range(3))))
 
@@ -112,11 +113,14 @@ class Stray:
         That, minus the place's world coordinates.
     turned_rad
         How far its faces are turned against the target's.
+    bent_rad
+        How far the angles between its faces are from those between the target's.
     """
 
     corner_world: FloatArray
     off: FloatArray
     turned_rad: float
+    bent_rad: float
 
 
 def nearest_strays(
@@ -132,7 +136,8 @@ def nearest_strays(
     # Not the background; but the target itself may have been left where it was at another place.
     expected = match.T_world_lidar.inverse() @ world
     known = (np.linalg.norm(nodes.corner[:, None] - expected, axis=-1) < TOLERANCE_M).any(axis=1)
-    eligible = _moving(nodes, world) | known
+    # A face of few returns is tilted, and its corner off, by chance alone.
+    eligible = (_moving(nodes, world) | known) & (nodes.support >= STRAY_SUPPORT)
     first = next(p for p, c in enumerate(match.choice) if c is not None)
     reference = candidates[first][match.choice[first] or 0]
     found: dict[int, Stray] = {}
@@ -140,7 +145,7 @@ def nearest_strays(
         here = np.flatnonzero((nodes.place == place) & eligible & (nodes.convex == reference.convex))
         strays = [_stray(match, nodes.corner[k], nodes.normals[k], reference.normals, world[place]) for k in here]
         elsewhere = [s for s in strays if s.turned_rad < SAME_ORIENTATION_RAD]
-        turned = [s for s in strays if np.linalg.norm(s.off) < 2.0 * TOLERANCE_M and s.turned_rad < MAX_TURN_RAD]
+        turned = [s for s in strays if np.linalg.norm(s.off) < 2.0 * TOLERANCE_M and _is_turn(s)]
         if turned and not any(np.linalg.norm(s.off) < 2.0 * TOLERANCE_M for s in elsewhere):
             found[place] = min(turned, key=lambda s: s.turned_rad)
         elif elsewhere:
@@ -152,7 +157,16 @@ def _stray(
     match: CornerMatch, corner: FloatArray, normals: FloatArray, reference: FloatArray, world: FloatArray
 ) -> Stray:
     stands = np.asarray(match.T_world_lidar @ corner)
-    return Stray(stands, stands - world, face_order(normals, reference)[1])
+    order, turned_rad = face_order(normals, reference)
+    between = [
+        np.arccos(np.clip((n @ n.T)[np.triu_indices(3, 1)], -1.0, 1.0)) for n in (normals[list(order)], reference)
+    ]
+    return Stray(stands, stands - world, turned_rad, float(np.abs(between[0] - between[1]).max()))
+
+
+def _is_turn(stray: Stray) -> bool:
+    """Whether all its faces are turned alike: a badly seen face is tilted against the others."""
+    return stray.turned_rad < MAX_TURN_RAD and stray.bent_rad < 0.3 * stray.turned_rad
 
 
 def _collect(candidates: Sequence[Sequence[CornerCandidate]]) -> _Nodes:

@@ -31,6 +31,9 @@ from lidarpose.solve.corner_matching import (
 # A hint is right within 0.3 m, and a target no larger than this beyond the corner.
 HINT_CROP_M = 1.5
 MIN_FACE_RETURNS = 12
+# A face in a single frame: at the first look, and at later ones where no target was found.
+FACE_RETURNS, FEWEST_FACE_RETURNS = 30, 15
+LOOKS = 4
 GATE_SIGMAS = 6.5
 FIRST_GATE_M = 0.05
 SPOT_RAD = np.radians(1.2)
@@ -145,12 +148,15 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
     with ThreadPoolExecutor(2) as pool:
         candidates = list(pool.map(corners_at, session.places))
     matches, world, oddity = _match_with_mistakes(candidates, world, session.estimate_scale)
-    missing = [k for k in range(len(world)) if not matches or matches[0].choice[k] is None]
-    if missing:
-        # Look again there, with another frame and another draw of samples.
+    for attempt in range(1, LOOKS):
+        missing = [k for k in range(len(world)) if not matches or matches[0].choice[k] is None]
+        if not missing:
+            break
+        # Look again there, with another frame, another draw of samples, and for smaller faces.
         for k in missing:
             place = session.places[k]
-            candidates[k] += place_corners(place, seed + 1, len(place.clouds) // 2)
+            frame = attempt * len(place.clouds) // LOOKS
+            candidates[k] += place_corners(place, seed + attempt, frame, FEWEST_FACE_RETURNS)
         matches, world, oddity = _match_with_mistakes(candidates, world_coordinates(session), session.estimate_scale)
     if not matches:
         raise _not_found(session, candidates)
@@ -185,13 +191,15 @@ def _stray_in_words(session: CornerSession, world: FloatArray, place: int, stray
     return text
 
 
-def place_corners(place: CornerPlace, seed: int = 0, frame: int = 0) -> tuple[CornerCandidate, ...]:
-    """All corners in one frame of a place, or those near the hint."""
+def place_corners(
+    place: CornerPlace, seed: int = 0, frame: int = 0, min_points: int = FACE_RETURNS
+) -> tuple[CornerCandidate, ...]:
+    """All corners in one frame of a place, or those near the hint, of faces with `min_points` returns or more."""
     points = load_points(place.clouds[frame])
     if place.near is not None:
         offset = points - place.near.astype(points.dtype)
         points = points[np.einsum("ij,ij->i", offset, offset) < HINT_CROP_M**2]
-    patches = segment_planes(points, PlaneSearch(from_sensor=True, seed=seed))
+    patches = segment_planes(points, PlaneSearch(min_points=min_points, from_sensor=True, seed=seed))
     return find_corners(points, patches, place.near, NEAR_RADIUS_M)
 
 
