@@ -1,4 +1,4 @@
-"""Images from files: the fast decoder sees what OpenCV sees, and leaves to it what it does not know."""
+"""Images from files: as they were written, to the bit, or refused."""
 
 from pathlib import Path
 

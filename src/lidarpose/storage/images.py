@@ -93,9 +93,6 @@ def _read_bytes(path: Path, limit: int) -> bytes:
 
 
 def _decode(path: Path, data: bytes) -> GrayImage:
-    grey = _fast_png(data)
-    if grey is not None:
-        return grey
     import cv2
 
     image = None
@@ -109,27 +106,6 @@ def _decode(path: Path, data: bytes) -> GrayImage:
             path, "cannot be decoded", expected="a PNG, BMP, TIFF or JPEG image of 8 or 16 bit", remedy="Copy it again."
         )
     return np.asarray(image, np.uint8) if image.dtype == np.uint8 else np.asarray(image, np.uint16)
-
-
-def _fast_png(data: bytes) -> GrayImage | None:
-    """A PNG of 8 bit grey in half of OpenCV's time, by a library of the `fast` extra; None for all else.
-
-    What is wrong with a file is left to OpenCV to find, so that it is the same with and without the extra.
-    """
-    # Bit depth 8, grey, not interlaced: bytes 24, 25 and 28 of the header.
-    if not data.startswith(_PNG) or len(data) < 29 or data[24:26] != b"\x08\x00" or data[28] != 0:
-        return None
-    try:
-        from kornia_rs.io import decode_image_png_u8
-    except ImportError:
-        return None
-    width, height = struct.unpack_from(">II", data, len(_PNG) + 8)
-    try:
-        return np.asarray(decode_image_png_u8(data, (height, width), "mono"), np.uint8)[..., 0]
-    except (KeyboardInterrupt, SystemExit):
-        raise
-    except BaseException:  # a panic of the library, on damage or for want of memory, is no Exception
-        return None
 
 
 def png_size(path: Path, data: bytes) -> tuple[int, int]:

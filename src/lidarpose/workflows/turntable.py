@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import chain, groupby
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from lidarpose.errors import InputError, UndeterminedError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose, log_so3
 from lidarpose.model.calibration import Quality, TurntableCalibration
+from lidarpose.model.image import GrayImage
 from lidarpose.model.observation import LeftOut, PlaceFeatures, ScanLine, StripePoints, TurntableObservations
 from lidarpose.model.sense import StatedSense
 from lidarpose.model.session import TurntablePlace, TurntableSession
@@ -39,6 +41,9 @@ Step = Callable[[], None]
 
 IMAGES_AT_ONCE = 8
 """Stripe images that are fitted together: enough that single ones cost little, few enough for memory and progress."""
+
+BATCHES_AHEAD = 4
+"""So many batches of images are decoded while earlier ones are searched; more would only take memory."""
 
 MOST_CONTRADICTING = 0.15
 """Share of the places with both stripes that may contradict the others before the whole is in doubt."""
@@ -211,30 +216,54 @@ def doubted(quality: Quality | None, features: DetectedFeatures, observations: T
 def detect_features(session: TurntableSession, *, step: Step | None = None) -> DetectedFeatures:
     """Boards, stripes and scan lines of a session (sections 1.2 to 1.4), on all cores.
 
-    Results are in the order of the places, whatever thread made them. Scans are read while the board is looked for.
+    Images are decoded ahead by threads of their own: decoding is most of the work, and leaves the interpreter free for
+    the rest, which is done here, place after place.
     """
+    batches = _batches(session.places)
     executor = ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1))
     try:
-        all_lines = executor.map(lambda place: _find_scan_lines(session, place), session.places)
+        decoded = _decoded_ahead(executor, batches)
         boards, finders = {}, {}
         for placement, sources in session.board_images.items():
             boards[placement], finders[placement] = _detect_board(session, placement, [s.load() for s in sources])
-        batches = _batches(session.places)
-        all_stripes = chain.from_iterable(executor.map(lambda batch: _find_stripes(finders, batch), batches))
-        places, left_out = [], []
-        for place, lines, (stripes, problems) in zip(session.places, all_lines, all_stripes, strict=True):
-            left_out += problems
-            if isinstance(lines, LeftOut):
-                left_out.append(lines)
-            else:
-                angle = place.turntable_angle_rad
-                places.append(PlaceFeatures(place.position, angle, stripes, lines, place.placement))
-            if step is not None:
-                step()
+        places: list[PlaceFeatures] = []
+        left_out: list[LeftOut] = []
+        for batch in batches:
+            all_lines = [_find_scan_lines(session, place) for place in batch]
+            images = [None if image is None else image.result() for image in next(decoded)]
+            all_stripes = _find_stripes(finders[batch[0].placement], batch, images)
+            for place, lines, (stripes, problems) in zip(batch, all_lines, all_stripes, strict=True):
+                left_out += problems
+                if isinstance(lines, LeftOut):
+                    left_out.append(lines)
+                else:
+                    angle = place.turntable_angle_rad
+                    places.append(PlaceFeatures(place.position, angle, stripes, lines, place.placement))
+                if step is not None:
+                    step()
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
     notes = tuple(note for board in boards.values() for note in board.notes)
     return DetectedFeatures(boards, tuple(places), tuple(left_out), notes)
+
+
+def _decoded_ahead(
+    executor: ThreadPoolExecutor, batches: Sequence[Sequence[TurntablePlace]]
+) -> Iterator[list[Future[GrayImage] | None]]:
+    """The stripe images of each batch, in order; `BATCHES_AHEAD` of them are on their way at any time."""
+
+    def start(batch: Sequence[TurntablePlace]) -> list[Future[GrayImage] | None]:
+        return [None if p.stripe_image is None else executor.submit(p.stripe_image.load) for p in batch]
+
+    # Not a generator from the first line on: decoding is to start now.
+    waiting = deque(start(batch) for batch in batches[:BATCHES_AHEAD])
+
+    def in_order() -> Iterator[list[Future[GrayImage] | None]]:
+        for following in (*batches[BATCHES_AHEAD:], *[()] * BATCHES_AHEAD):
+            yield waiting.popleft()
+            waiting.append(start(following))
+
+    return in_order()
 
 
 def _detect_board(
@@ -270,14 +299,13 @@ def _batches(places: Sequence[TurntablePlace]) -> list[Sequence[TurntablePlace]]
 
 
 def _find_stripes(
-    finders: Mapping[str, StripeFinder], places: Sequence[TurntablePlace]
+    finder: StripeFinder, places: Sequence[TurntablePlace], images: Sequence[GrayImage | None]
 ) -> list[tuple[Mapping[int, StripePoints], list[LeftOut]]]:
-    """Stripes of each place by panel, and what was given up; the places are all of one placement."""
-    images = [place.stripe_image.load() for place in places if place.stripe_image is not None]
-    detections = iter(finders[places[0].placement].find_in(images))
+    """Stripes of each place by panel, and what was given up."""
+    detections = iter(finder.find_in([image for image in images if image is not None]))
     found: list[tuple[Mapping[int, StripePoints], list[LeftOut]]] = []
-    for place in places:
-        if place.stripe_image is None:
+    for place, image in zip(places, images, strict=True):
+        if image is None:
             found.append(({}, []))
             continue
         detection = next(detections)
