@@ -119,12 +119,18 @@ def _beaten_by_motion(pool: Pool, best: Solution, rival: Solution, look: Callabl
     both = np.flatnonzero(support & (rival.chosen >= 0))
     if len(both) < 3 or theirs * np.sqrt(smallest) < FAR_OFF_RAD:
         both = both[np.unique(np.linspace(0, len(both) - 1, LOOKED_AT).astype(int))]
-        ours, theirs = look(best, both), look(rival, both)
-    else:
-        both = np.flatnonzero(support)
+        theirs = look(rival, both)
+        # A closer look only ever lowers the misfit: if the rival is beaten without one at the best, it is with one.
+        ours = float(np.sqrt(np.mean(best.misfit[both] ** 2)))
+        return _is_smaller(ours, theirs, len(both)) or _is_smaller(look(best, both), theirs, len(both))
+    return _is_smaller(ours, theirs, int(support.sum()))
+
+
+def _is_smaller(ours: float, theirs: float, places: int) -> bool:
+    """Whether one root mean square misfit is smaller than another by more than chance explains."""
     # Residuals far below the stated sigma are rounding, not evidence.
     ratio = theirs / max(ours, 0.02)
-    freedom = max(6 * len(both) - 10, 1)
+    freedom = max(6 * places - 10, 1)
     needed = LEAST_DEVIATIONS / np.sqrt(freedom) * (1.0 + 5.0 / freedom)
     return bool(ratio > LEAST_RATIO and np.log(ratio) > needed)
 
