@@ -1,6 +1,7 @@
 """The joint estimate: exact data, noise, outliers, options, and data that determine nothing."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,12 +26,12 @@ def rough_start(rig: TurntableRig, size: float = 2e-3, seed: int = 0) -> Turntab
     return TurntableMotion(T, shifted)
 
 
-def refine(rig: TurntableRig, observations: TurntableObservations, **options: object) -> TurntableEstimate:
+def refine(rig: TurntableRig, observations: TurntableObservations, **options: Any) -> TurntableEstimate:
     return refine_turntable(
         observations,
         rough_start(rig),
         rig.T_camera_panel,
-        JointOptions(**options),  # type: ignore[arg-type]
+        JointOptions(**options),
     )
 
 

@@ -1,5 +1,7 @@
 """Observations from geometry: exact without noise, by formulas that the simulator does not use."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -17,7 +19,7 @@ def pose_by_matrices(rig: TurntableRig, place: int) -> Pose:
     return Pose.from_matrix(m.T_camera_turntable.matrix @ turn @ m.T_turntable_lidar.matrix)
 
 
-def brown(camera, x, y):  # type: ignore[no-untyped-def]
+def brown(camera: Any, x: Any, y: Any) -> Any:
     """The paper's lens model, written out."""
     k1, k2 = camera.distortion[:2]
     r2 = x * x + y * y

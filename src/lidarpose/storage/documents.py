@@ -85,9 +85,8 @@ def _yaml_constructor() -> Any:
     """ruamel's safe constructor, to which OpenCV's matrices are mappings; every other tag is an error."""
     from ruamel.yaml.constructor import SafeConstructor
 
-    class Constructor(SafeConstructor):  # type: ignore[misc, unused-ignore]
-        pass
-
+    # Made by `type`: ruamel states no types to inherit from.
+    Constructor: Any = type("Constructor", (SafeConstructor,), {})
     Constructor.add_constructor("tag:yaml.org,2002:opencv-matrix", SafeConstructor.construct_yaml_map)
     return Constructor
 
@@ -98,13 +97,12 @@ def _yaml_composer() -> Any:
     from ruamel.yaml.composer import Composer
     from ruamel.yaml.events import AliasEvent
 
-    class Plain(Composer):  # type: ignore[misc, unused-ignore]
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            if self.parser.check_event(AliasEvent):
-                raise ValueError("it has an alias, which files of cameras do not need")
-            return super().compose_node(parent, index)
+    def compose_node(self: Any, parent: Any, index: Any) -> Any:
+        if self.parser.check_event(AliasEvent):
+            raise ValueError("it has an alias, which files of cameras do not need")
+        return Composer.compose_node(self, parent, index)
 
-    return Plain
+    return type("Plain", (Composer,), {"compose_node": compose_node})
 
 
 def read_opencv_xml(path: Path) -> dict[str, Any]:
