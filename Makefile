@@ -37,14 +37,16 @@ test-slow: setup
 accuracy-world: setup
 	$(BIN)/python benchmarks/accuracy_world.py --output docs/accuracy-world.md
 
-# Damaged files for every reader, guided by coverage, for FUZZ_SECONDS or a little more. atheris lies in a folder of its
-# own, as it has no wheel for every Python and system; where it has none, this says so and does nothing.
+# Damaged files for every reader, guided by coverage, for FUZZ_SECONDS or a little more; FUZZ_SEED=0 draws other
+# damage each time. atheris lies in a folder of its own, as it has no wheel for every Python and system; where it has
+# none, this says so and does nothing.
 FUZZ_SECONDS ?= 75
+FUZZ_SEED ?= 1
 FUZZ_PACKAGES := $(VENV)/fuzz
 fuzz: setup
 	-test -d $(FUZZ_PACKAGES)/atheris || $(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes \
 	  --only-binary :all: --target $(FUZZ_PACKAGES) --requirement tests/fuzz-requirements.lock
-	cd tests && PYTHONPATH=$(abspath $(FUZZ_PACKAGES)) $(abspath $(BIN))/python -m tests_support.atheris_job --seconds $(FUZZ_SECONDS)
+	cd tests && PYTHONPATH=$(abspath $(FUZZ_PACKAGES)) $(abspath $(BIN))/python -m tests_support.atheris_job --seconds $(FUZZ_SECONDS) --seed $(FUZZ_SEED)
 
 # The figures of docs/formats.md again; half an hour.
 fuzz-figures: fuzz

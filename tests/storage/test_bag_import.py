@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -397,6 +398,18 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
     for name in ("text.bag", "folder", "a.zip", "missing.bag", "a?b.db3", "big", "evil"):
         with pytest.raises(InputError, match=name.replace("?", r"\?")):
             import_bag(tmp_path / name, tmp_path / "out")
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("count", ["^", "'=0'", "[]", "{a: 1}", "1e999"])
+def test_words_for_counts_are_refused(tmp_path: Path, kind: str, count: str) -> None:
+    bag = bags.write_bag(tmp_path, kind, turning(kind))
+    metadata = bag / "metadata.yaml"
+    text = metadata.read_text()
+    metadata.write_text(re.sub(r"(- message_count:) \d+", rf"\1 {count}", text))
+    assert metadata.read_text() != text
+    with pytest.raises(InputError, match=re.escape(str(bag))):
+        import_bag(bag, tmp_path / "out")
 
 
 def test_a_forged_message_length_is_refused(tmp_path: Path) -> None:

@@ -127,7 +127,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
             reader, decode = _reader(storage)
             reader.open()
         try:
-            yield Bag(path, reader, decode)
+            with _as_input_errors(path):  # metadata.yaml may hold words where it should hold counts
+                bag = Bag(path, reader, decode)
+            yield bag
         finally:
             with _as_input_errors(path):
                 reader.close()
