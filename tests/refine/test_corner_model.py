@@ -123,7 +123,7 @@ def test_uncertain_world_coordinates_are_found_out_and_covered() -> None:
         places = observe(directions, rng)
         places = [replace(p, corner_world=p.corner_world + rng.normal(0.0, 0.004, 3)) for p in places]
         exact = fit_corner_model(places, start(), SIGMA_M)
-        sigma, gain = estimate_world_sigma(places, exact)
+        sigma, gain = estimate_world_sigma(exact)
         sigmas.append(sigma)
         assert gain > 3.0
         fit = fit_corner_model(places, exact.state, SIGMA_M, CornerOptions(0.004))
@@ -139,7 +139,7 @@ def test_exact_world_coordinates_are_taken_for_exact() -> None:
     gains = []
     for _ in range(20):
         places = observe(directions, rng)
-        gains.append(estimate_world_sigma(places, fit_corner_model(places, start(), SIGMA_M))[1])
+        gains.append(estimate_world_sigma(fit_corner_model(places, start(), SIGMA_M))[1])
     assert np.mean(np.array(gains) > 9.0) <= 0.05
 
 

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, perpendicular_pair
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, cross3, perpendicular_pair
 from lidarpose.geometry.planes import Plane
 from lidarpose.model.corner_result import CornerCandidate
 from lidarpose.model.plane_patch import PlanePatch
@@ -218,54 +218,73 @@ class FaceMask:
         -------
         Indices (M,), and the face (M,) of each: 0, 1 or 2.
         """
-        face, predicted = self.meet(directions)
+        rays = np.ascontiguousarray(directions.T)
+        face, predicted, slope = self._meet(rays)
         with np.errstate(invalid="ignore"):
             chosen = np.flatnonzero(np.abs(range_m - predicted) < gate_m)
         face, predicted = face[chosen], predicted[chosen]
-        inside = self._inside(directions[chosen] * predicted[:, None], face)
-        return chosen[inside], face[inside]
+        indices, faces = [], []
+        for j in range(3):
+            mine = np.flatnonzero(face == j)
+            on_face = predicted[mine]
+            mine = chosen[mine]
+            good = self._inside(j, rays[:, mine] * on_face, slope[:, mine] * on_face)
+            indices.append(mine[good])
+            faces.append(np.full(int(np.count_nonzero(good)), j))
+        return np.concatenate(indices), np.concatenate(faces)
 
     def meet(self, directions: FloatArray) -> tuple[IntArray, FloatArray]:
         """By direction (N, 3): the face met, and the range there; inf where the beam meets none."""
-        slope = self.normals @ directions.T
+        face, best, _ = self._meet(np.ascontiguousarray(directions.T))
+        return face, best
+
+    def _meet(self, rays: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """By ray (3, N): face and range as `meet` tells them, and the cosines (3, N) to the normals."""
+        slope = self.normals @ rays
         height = self.normals @ self.corner
         facing = slope < -0.02
-        worst = -np.inf if self.convex else np.inf
         with np.errstate(divide="ignore"):
-            ranges = np.where(facing, height[:, None] / slope, worst)
-        face = np.argmax(ranges, axis=0) if self.convex else np.argmin(ranges, axis=0)
-        best = np.take_along_axis(ranges, face[None], axis=0)[0]
+            a, b, c = np.where(facing, height[:, None] / slope, -np.inf if self.convex else np.inf)
         if self.convex:
+            second = b > a
+            best = np.maximum(a, b)
+            third = c > best
             # Whoever leaves one of a convex corner's planes behind never enters the solid.
-            best = np.where(facing.all(axis=0), best, np.inf)
-        return face.astype(np.int64), best
+            best = np.where(facing[0] & facing[1] & facing[2], np.maximum(best, c), np.inf)
+        else:
+            second = b < a
+            best = np.minimum(a, b)
+            third = c < best
+            best = np.minimum(best, c)
+        return np.where(third, 2, second).astype(np.int64), best, slope
 
-    def _inside(self, on_face: FloatArray, face: IntArray) -> BoolArray:
-        """Which predicted points (N, 3) lie in their face's outline, off its edges with others and off obstacles."""
-        inside = np.zeros(len(on_face), dtype=bool)
-        for j in range(3):
-            mine = np.flatnonzero(face == j)
-            p = on_face[mine]
-            good = _in_outline(p, self.outlines[j], self.normals[j], 0.02)
-            for k in range(3):
-                if k != j:
-                    # Distance from the common edge, along this face.
-                    sine = float(np.linalg.norm(np.cross(self.normals[j], self.normals[k])))
-                    edge = np.abs((p - self.corner) @ self.normals[k]) / sine
-                    good &= edge > self.margin_m
-            for plane in self.obstacles:
-                sine = max(float(np.linalg.norm(np.cross(self.normals[j], plane.normal))), 0.2)
-                good &= plane.distance(p) / sine > 2.0 * self.margin_m + 0.01
-            inside[mine] = good
-        return inside
+    def _inside(self, face: int, on_face: FloatArray, height: FloatArray) -> BoolArray:
+        """Which predicted points (3, N) of a face lie in its outline, off its edges with others and off obstacles.
+
+        `height` (3, N) are their projections onto the three normals.
+        """
+        normal = self.normals[face]
+        good = _in_outline(on_face, self.outlines[face], normal, 0.02)
+        for k in range(3):
+            if k != face:
+                # Distance from the common edge, along this face.
+                sine = float(np.linalg.norm(cross3(normal, self.normals[k])))
+                good &= np.abs(height[k] - self.normals[k] @ self.corner) > self.margin_m * sine
+        for plane in self.obstacles:
+            sine = max(float(np.linalg.norm(cross3(normal, plane.normal))), 0.2)
+            good &= plane.normal @ on_face - plane.offset > sine * (2.0 * self.margin_m + 0.01)
+        return good
 
 
 def _in_outline(points: FloatArray, outline: FloatArray, normal: FloatArray, slack_m: float) -> BoolArray:
-    """Which points (N, 3) of a plane lie in a convex outline (K, 3), widened by `slack_m`."""
+    """Which points (3, N) of a plane lie in a convex outline (K, 3), widened by `slack_m`."""
     edges = np.roll(outline, -1, axis=0) - outline
     inward = np.cross(normal, edges)
     length = np.linalg.norm(inward, axis=1)
     keep = length > 1e-9
     inward = inward[keep] / length[keep, None]
-    height = points @ inward.T - np.einsum("ij,ij->i", inward, outline[keep])
-    return np.asarray((height > -slack_m).all(axis=1))
+    least = np.einsum("ij,ij->i", inward, outline[keep]) - slack_m
+    good = np.ones(points.shape[1], dtype=bool)
+    for edge, offset in zip(inward, least, strict=True):
+        good &= edge @ points > offset
+    return good

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
 
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
@@ -59,6 +62,15 @@ class FaceReturns:
 
     def __len__(self) -> int:
         return len(self.range_m)
+
+    @cached_property
+    def rays(self) -> FloatArray:
+        """The directions as contiguous rows (3, N), over which arithmetic runs fastest."""
+        return np.ascontiguousarray(self.directions.T)
+
+    def subset(self, index: IntArray) -> FaceReturns:
+        """Those of the returns that `index` (M,), ascending, tells."""
+        return FaceReturns(self.rays.take(index, axis=1).T, self.range_m[index], self.frame[index])
 
 
 @dataclass(frozen=True, eq=False)

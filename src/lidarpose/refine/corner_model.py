@@ -29,6 +29,7 @@ from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 TUKEY_K = 6.0
 MIN_SIGMA_M = 1e-6
 MAX_STEPS = 50
+SETTLED = 1e-3
 MIN_RETURNS = 3
 
 
@@ -108,8 +109,7 @@ class CornerOptions:
 class _Face:
     place: int
     face: int
-    directions: FloatArray
-    range_m: FloatArray
+    returns: FaceReturns
     residual: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
@@ -120,30 +120,42 @@ def tangents(normal: FloatArray) -> FloatArray:
 
 def face_residuals(returns: FaceReturns, normal: FloatArray, corner: FloatArray) -> FloatArray:
     """Measured minus expected ranges (N,), metres."""
-    return np.asarray(returns.range_m - (normal @ corner) / (returns.directions @ normal))
+    return np.asarray(returns.range_m - (normal @ corner) / (normal @ returns.rays))
 
 
-def direction_cells(directions: FloatArray, cell_rad: float) -> IntArray:
-    """Which cell (N,) of a grid of angles about the bundle's middle each direction (N, 3) falls in, counted from 0."""
-    mean = directions.mean(axis=0)
-    local = directions @ np.linalg.svd(mean[None])[2].T
-    depth = np.abs(local[:, 0])
-    angles = np.column_stack([np.arctan2(local[:, 1], depth), np.arctan2(local[:, 2], depth)])
+def direction_cells(rays: FloatArray, cell_rad: float) -> IntArray:
+    """Which cell (N,) of a grid of angles about the bundle's middle each ray (3, N) falls in, counted from 0."""
+    local = np.linalg.svd(rays.mean(axis=1)[None])[2] @ rays
+    angles = np.arctan(local[1:] / np.maximum(np.abs(local[0]), 1e-12))
     grid = np.floor(angles / cell_rad).astype(np.int64)
-    grid -= grid.min(axis=0)
-    flat = grid[:, 0] * (int(grid[:, 1].max()) + 1) + grid[:, 1]
-    return np.asarray(np.unique(flat, return_inverse=True)[1].ravel(), dtype=np.int64)
+    grid -= grid.min(axis=1, keepdims=True)
+    flat = grid[0] * (int(grid[1].max()) + 1) + grid[1]
+    number = np.cumsum(np.bincount(flat) > 0) - 1
+    return np.asarray(number[flat], dtype=np.int64)
 
 
-def _rows(directions: FloatArray, normal: FloatArray, corner: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Expected ranges (N,), and their derivatives (N, 3) by the plane's shift and two tilts about the corner."""
-    slope = directions @ normal
-    expected = (normal @ corner) / slope
-    E = tangents(normal)
-    rows = np.empty((len(slope), 3))
-    rows[:, 0] = 1.0 / slope
-    rows[:, 1:] = ((corner @ E) - expected[:, None] * (directions @ E)) / slope[:, None]
+def _rows(rays: FloatArray, normal: FloatArray, corner: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Expected ranges (N,), and their derivatives (3, N) by the plane's shift and two tilts about the corner."""
+    axes = np.vstack([normal, tangents(normal).T])
+    rows = axes @ rays
+    along = axes @ corner
+    shift = 1.0 / rows[0]
+    expected = along[0] * shift
+    rows[1:] *= expected
+    np.subtract(along[1:, None], rows[1:], out=rows[1:])
+    rows[1:] *= shift
+    rows[0] = shift
     return expected, rows
+
+
+def _weights(residual: FloatArray, sigma_m: float) -> FloatArray:
+    """Tukey's weight psi(r)/r of residuals (N,)."""
+    z2 = residual * (1.0 / (TUKEY_K * sigma_m))
+    z2 *= z2
+    np.subtract(1.0, z2, out=z2)
+    np.maximum(z2, 0.0, out=z2)
+    z2 *= z2
+    return z2
 
 
 def _loss_terms(residual: FloatArray, sigma_m: float) -> tuple[FloatArray, FloatArray]:
@@ -153,11 +165,11 @@ def _loss_terms(residual: FloatArray, sigma_m: float) -> tuple[FloatArray, Float
 
 
 def _system(face: _Face, normal: FloatArray, corner: FloatArray, sigma_m: float) -> FaceSystem:
-    expected, rows = _rows(face.directions, normal, corner)
-    face.residual = face.range_m - expected
-    weight, _ = _loss_terms(face.residual, sigma_m)
-    weighted = rows * (weight / sigma_m**2)[:, None]
-    return FaceSystem(weighted.T @ rows, weighted.T @ face.residual, float(weight.sum()))
+    expected, rows = _rows(face.returns.rays, normal, corner)
+    face.residual = face.returns.range_m - expected
+    weight = _weights(face.residual, sigma_m)
+    weighted = rows * (weight / sigma_m**2)
+    return FaceSystem(weighted @ rows.T, weighted @ face.residual, float(weight.sum()))
 
 
 def _wide_enough(sigma_m: float, residuals: Sequence[FloatArray]) -> float:
@@ -213,7 +225,7 @@ def fit_corner(
     for _ in range(MAX_STEPS):
         residuals, moves, tilts = [], [], []
         for j in range(3):
-            face = _Face(0, j, faces[j].directions, faces[j].range_m)
+            face = _Face(0, j, faces[j])
             system = _system(face, normals[j], corner, sigma_m)
             residuals.append(face.residual)
             tilts.append(_without_first(system.information))
@@ -265,15 +277,10 @@ def fit_corner_model(
     """
     options = options or CornerOptions()
     world = np.stack([p.corner_world for p in places])
-    faces = [
-        _Face(i, j, f.directions, f.range_m)
-        for i, p in enumerate(places)
-        for j, f in sorted(p.faces.items())
-        if len(f) >= MIN_RETURNS
-    ]
+    faces = [_Face(i, j, f) for i, p in enumerate(places) for j, f in sorted(p.faces.items()) if len(f) >= MIN_RETURNS]
     names = parameter_names([p.position for p in places], options)
     corners = start.corners(world)
-    first = [face_residuals(places[f.place].faces[f.face], start.normals[f.face], corners[f.place]) for f in faces]
+    first = [face_residuals(f.returns, start.normals[f.face], corners[f.place]) for f in faces]
     sigma_m = _wide_enough(sigma_m, first)
     state, step = start, 0
     for step in range(1, MAX_STEPS + 1):
@@ -282,7 +289,8 @@ def fit_corner_model(
         state = _moved(state, delta, options)
         residuals = np.concatenate([f.residual for f in faces])
         sigma_m = max(mad_sigma(residuals, centred=True), MIN_SIGMA_M)
-        if np.linalg.norm(delta[:6]) < 1e-8 and step > 2:
+        # Settled to a thousandth of a standard deviation, whatever the unit of each parameter.
+        if delta @ information @ delta < SETTLED**2 and step > 2:
             break
     information, _, systems = _assemble(faces, state, world, sigma_m, options)
     residuals = np.concatenate([f.residual for f in faces])
@@ -296,7 +304,7 @@ def fit_corner_model(
         world,
         options.world_sigma_m,
         step,
-        sum(len(f.range_m) for f in faces),
+        sum(len(f.returns) for f in faces),
     )
 
 
@@ -346,26 +354,31 @@ def _corner_jacobian(
 def _assemble(
     faces: Sequence[_Face], state: CornerState, world: FloatArray, sigma_m: float, options: CornerOptions
 ) -> tuple[FloatArray, FloatArray, dict[tuple[int, int], FaceSystem]]:
+    """The normal equations of the whole, and each face's own, at a state."""
+    corners = state.corners(world)
+    systems = {(f.place, f.face): _system(f, state.normals[f.face], corners[f.place], sigma_m) for f in faces}
+    return *_joined(systems, state, world, options), systems
+
+
+def _joined(
+    systems: Mapping[tuple[int, int], FaceSystem], state: CornerState, world: FloatArray, options: CornerOptions
+) -> tuple[FloatArray, FloatArray]:
     """The normal equations of the whole, from each face's own."""
     tilts, errors, width = _columns(len(world), options)
     information, gradient = np.zeros((width, width)), np.zeros(width)
     corners = state.corners(world)
     jacobians = [_corner_jacobian(state, world, i, corners[i], options) for i in range(len(world))]
-    systems = {}
-    for face in faces:
-        normal = state.normals[face.face]
-        system = _system(face, normal, corners[face.place], sigma_m)
+    for (place, face), system in systems.items():
         B = np.zeros((3, width))
-        B[0] = normal @ jacobians[face.place]
-        B[1:, tilts + 2 * face.face : tilts + 2 * face.face + 2] = np.eye(2)
+        B[0] = state.normals[face] @ jacobians[place]
+        B[1:, tilts + 2 * face : tilts + 2 * face + 2] = np.eye(2)
         information += B.T @ system.information @ B
         gradient += B.T @ system.gradient
-        systems[face.place, face.face] = system
     if options.world_sigma_m > 0.0:
         prior = 1.0 / options.world_sigma_m**2
         information[errors:, errors:] += prior * np.eye(width - errors)
         gradient[errors:] -= prior * state.world_errors.ravel()
-    return information, gradient, systems
+    return information, gradient
 
 
 def _moved(state: CornerState, delta: FloatArray, options: CornerOptions) -> CornerState:
@@ -403,15 +416,16 @@ def frame_corners(
     moves = np.full((frames, 3, 3), np.nan)
     for j in range(3):
         f = faces[j]
-        expected, rows = _rows(f.directions, normals[j], corner)
+        expected, rows = _rows(f.rays, normals[j], corner)
         residual = f.range_m - expected
-        weight, _ = _loss_terms(residual, sigma_m)
+        weight = _weights(residual, sigma_m)
+        weighted = weight * rows
         H = np.zeros((frames, 3, 3))
         g = np.zeros((frames, 3))
         for a in range(3):
-            g[:, a] = np.bincount(f.frame, weight * rows[:, a] * residual, frames)
+            g[:, a] = np.bincount(f.frame, weighted[a] * residual, frames)
             for b in range(a, 3):
-                H[:, a, b] = H[:, b, a] = np.bincount(f.frame, weight * rows[:, a] * rows[:, b], frames)
+                H[:, a, b] = H[:, b, a] = np.bincount(f.frame, weighted[a] * rows[b], frames)
         enough = np.bincount(f.frame, weight > 0.0, frames) >= 6
         good = enough & (np.linalg.cond(H + 1e-12 * np.eye(3)) < 1e9)
         moves[good, j] = np.linalg.solve(H[good], g[good][..., None])[..., 0]
@@ -456,7 +470,28 @@ def place_discrepancies(fit: CornerFit) -> tuple[FloatArray, FloatArray, BoolArr
     return moves, statistic, known
 
 
-def estimate_world_sigma(places: Sequence[CornerPlaceFaces], fit: CornerFit) -> tuple[float, float]:
+def own_turns(fit: CornerFit) -> dict[int, tuple[float, float]]:
+    """By place with three faces: how far its own planes are tilted against the common ones, at most, in radians, and
+    a chi-square of six degrees of freedom. One step from the common planes, on all returns that met them."""
+    found = {}
+    for place in range(len(fit.world)):
+        systems = [fit.systems.get((place, j)) for j in range(3)]
+        tilts, total = [], 0.0
+        for system in systems:
+            if system is None:
+                break
+            try:
+                tilt = _solve(system.information, system.gradient, "a face")[1:]
+            except UndeterminedError:
+                break
+            tilts.append(float(np.linalg.norm(tilt)))
+            total += float(tilt @ _without_first(system.information) @ tilt)
+        if len(tilts) == 3:
+            found[place] = max(tilts), total
+    return found
+
+
+def estimate_world_sigma(fit: CornerFit) -> tuple[float, float]:
     """How well the world coordinates seem to be measured: restricted maximum likelihood on the collapsed systems.
 
     Parameters
@@ -469,15 +504,8 @@ def estimate_world_sigma(places: Sequence[CornerPlaceFaces], fit: CornerFit) -> 
     The standard deviation in metres (0 where nothing speaks against exact ones), and twice the gain in log likelihood.
     """
     options = CornerOptions(1.0, "log_scale" in fit.names)
-    faces = [
-        _Face(i, j, p.faces[j].directions, p.faces[j].range_m)
-        for i, p in enumerate(places)
-        for j in p.faces
-        if (i, j) in fit.systems
-    ]
-    information, gradient, _ = _assemble(
-        faces, replace(fit.state, world_errors=np.zeros_like(fit.world)), fit.world, fit.range_sigma_m, options
-    )
+    state = replace(fit.state, world_errors=np.zeros_like(fit.world))
+    information, gradient = _joined(fit.systems, state, fit.world, options)
     errors = _columns(len(fit.world), options)[1]
     size = len(gradient) - errors
     information[errors:, errors:] -= np.eye(size)

@@ -307,7 +307,7 @@ def _common_error_factor(fit: CornerFit, places: Sequence[CornerPlaceFaces]) -> 
         for j, returns in place.faces.items():
             residual = face_residuals(returns, fit.state.normals[j], corners[i])
             keep = np.abs(residual) < 4.0 * fit.range_sigma_m
-            cell = direction_cells(returns.directions[keep], CELL_RAD)
+            cell = direction_cells(returns.rays[:, keep], CELL_RAD)
             count = np.bincount(cell)
             mean = np.bincount(cell, residual[keep]) / count
             total += float((mean**2 * count).sum()) / fit.range_sigma_m**2

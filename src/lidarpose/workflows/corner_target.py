@@ -41,6 +41,9 @@ SPOT_RAD = np.radians(1.2)
 ODD_SPOT_SIGMAS = 1.75
 # The share of a face next to the corner on which the first fit stands, before its far edges are trusted.
 INNER_SHARE = 0.6
+# What is cut out around the faces as sighted: the fitted corner may be this far from the sighted one.
+CROP_MARGIN_M = 0.15
+GOLDEN = 0.6180339887498949
 
 Tick = Callable[[], None]
 
@@ -81,9 +84,25 @@ class PlaceCrop:
         return np.asarray(np.sqrt(np.einsum("ij,ij->i", self.points, self.points)))
 
     @cached_property
+    def rays(self) -> FloatArray:
+        """Unit beam directions as contiguous rows (3, N)."""
+        return np.ascontiguousarray(self.points.T) / self.range_m
+
+    @property
     def directions(self) -> FloatArray:
         """Unit beam directions (N, 3)."""
-        return np.asarray(self.points / self.range_m[:, None])
+        return self.rays.T
+
+    def thinned(self, most: int) -> PlaceCrop:
+        """About `most` of the points, spread evenly over all frames; all of them where there are hardly more.
+
+        The golden ratio's multiples hit no period of the beams' order.
+        """
+        count = len(self.frame)
+        if count < 1.5 * most:
+            return self
+        index = np.flatnonzero((np.arange(count) * GOLDEN) % 1.0 < most / count)
+        return PlaceCrop(self.points[index], self.frame[index], self.frames)
 
 
 def world_coordinates(session: CornerSession) -> FloatArray:
@@ -272,27 +291,34 @@ def gather(session: CornerSession, found: FoundTarget, *, tick: Tick = lambda: N
     """Cut the target's surroundings from all frames of all places."""
     corners, radius = expected_corners(found), _crop_radius(found)
 
-    def crop(task: tuple[CloudSource, FloatArray]) -> FloatArray:
-        source, corner = task
-        kept = _around(source.load().points, corner, radius)
+    def crop(task: tuple[CloudSource, FloatArray, FloatArray]) -> FloatArray:
+        source, low, high = task
+        kept = _inside_box(source.load().points, low, high)
         tick()
         return kept
 
     crops = []
     with ThreadPoolExecutor(2) as pool:
-        for place, corner in zip(session.places, corners, strict=True):
-            parts = list(pool.map(crop, [(source, corner) for source in place.clouds]))
+        for place, corner, sighting in zip(session.places, corners, found.sightings, strict=True):
+            low, high = corner - radius, corner + radius
+            if sighting is not None:
+                outlines = np.concatenate(sighting.outlines)
+                low, high = outlines.min(axis=0) - CROP_MARGIN_M, outlines.max(axis=0) + CROP_MARGIN_M
+            parts = list(pool.map(crop, [(source, low, high) for source in place.clouds]))
             frame = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
             crops.append(PlaceCrop(np.concatenate(parts), frame, len(parts)))
     return tuple(crops)
 
 
-def _around(points: NDArray[np.floating], centre: FloatArray, radius: float) -> FloatArray:
-    """Points (M, 3) within a radius: most fall out by their first coordinate alone, those without return too."""
+def _inside_box(points: NDArray[np.floating], low: FloatArray, high: FloatArray) -> FloatArray:
+    """Points (M, 3) in a box: most fall out by one coordinate alone, those without return too."""
+    few = points[:: max(len(points) // 1000, 1)]
     with np.errstate(invalid="ignore"):
-        slab = points[np.flatnonzero(np.abs(points[:, 0] - points.dtype.type(centre[0])) < radius)].astype(np.float64)
-        offset = slab - centre
-        return np.asarray(slab[np.einsum("ij,ij->i", offset, offset) < radius * radius])
+        axes = np.argsort(np.count_nonzero((few > low) & (few < high), axis=0))
+        for k in axes:
+            x = points[:, k]
+            points = points.take(np.flatnonzero((x > low[k]) & (x < high[k])), axis=0)
+    return points.astype(np.float64)
 
 
 def expected_corners(found: FoundTarget) -> FloatArray:
@@ -308,7 +334,7 @@ def _crop_radius(found: FoundTarget) -> float:
         if s is not None
         for outline in s.outlines
     ]
-    return max(reach) + 0.15
+    return max(reach) + CROP_MARGIN_M
 
 
 def margin_m(corner: FloatArray) -> float:
@@ -335,7 +361,7 @@ def select_faces(
         mine = index[face == j]
         if len(mine) < MIN_FACE_RETURNS:
             continue
-        returns = FaceReturns(crop.directions[mine], crop.range_m[mine], crop.frame[mine])
+        returns = FaceReturns(crop.rays.take(mine, axis=1).T, crop.range_m[mine], crop.frame[mine])
         if sigma_m is not None:
             returns = _second_screening(returns, mask.normals[j], mask.corner, sigma_m)
         if len(returns) >= MIN_FACE_RETURNS:
@@ -349,12 +375,11 @@ def _second_screening(returns: FaceReturns, normal: FloatArray, corner: FloatArr
     The paper screens by neighbours' normals; a spot's mean residual over all frames says the same, and sooner.
     """
     residual = face_residuals(returns, normal, corner)
-    cell = direction_cells(returns.directions, SPOT_RAD)
+    cell = direction_cells(returns.rays, SPOT_RAD)
     count = np.bincount(cell)
     mean = np.bincount(cell, residual) / count
     odd = (np.abs(mean) > ODD_SPOT_SIGMAS * sigma_m) & (np.abs(mean) * np.sqrt(count) > 4.5 * sigma_m)
-    keep = ~odd[cell]
-    return FaceReturns(returns.directions[keep], returns.range_m[keep], returns.frame[keep])
+    return returns.subset(np.flatnonzero(~odd[cell])) if odd.any() else returns
 
 
 def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> FreeCorner | None:
@@ -377,7 +402,7 @@ def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> Fre
             gate_m = min(gate_m, max(GATE_SIGMAS * sigma_m, 0.002))
     except UndeterminedError:
         return None
-    return fit if np.linalg.norm(corner - sighting.corner) < 0.15 else None
+    return fit if np.linalg.norm(corner - sighting.corner) < CROP_MARGIN_M else None
 
 
 def _reaches_both_ways(faces: dict[int, FaceReturns]) -> bool:

@@ -26,6 +26,7 @@ from lidarpose.refine.corner_model import (
     estimate_world_sigma,
     fit_corner_model,
     frame_corners,
+    own_turns,
 )
 from lidarpose.refine.corner_verdict import (
     CornerEvidence,
@@ -53,6 +54,8 @@ WORLD_METHODS: tuple[WorldMethod, ...] = ("joint", "paper", "paper-approx", "ran
 # Frames whose corner is this far out are of another scene: someone walked by, the target was being moved.
 JOINT_WHISKER = 3.0
 MIN_FRAMES_FOR_BOX_PLOT = 5
+# Returns around the target, of all frames of a place together, from which the first estimate is made.
+FIRST_RETURNS = 6000
 # Twice the gain in log likelihood at which uncertain world coordinates are believed in.
 CONVINCING_GAIN = 9.0
 
@@ -175,13 +178,15 @@ def _joint(
     limits: PrecisionLimits,
 ) -> WorldRun:
     mended = _usable_world(session, found)
-    fits = _place_fits(session, found, crops)
+    # First from a part of the returns, which tells where the faces are to a fraction of what all of them will.
+    few = [crop.thinned(FIRST_RETURNS) for crop in crops]
+    fits = _place_fits(session, found, few)
     start, sigma_m = _start(mended, found, fits)
     corners = _corners(start, fits, found)
-    places, left_out = observe(mended, found, crops, corners, start.normals, sigma_m)
-    places, frame_scatter, dropped = _without_odd_frames(places, corners, start.normals, sigma_m)
-    fit, used = _fit(mended, places, start, sigma_m, scale_too)
-    # Once more with the faces' beams selected by the estimate itself.
+    places, _ = observe(mended, found, few, corners, start.normals, sigma_m)
+    places, _, _ = _without_odd_frames(places, corners, start.normals, sigma_m)
+    fit, _ = _fit(mended, places, start, sigma_m, scale_too)
+    # Then from all, with the faces' beams selected by the estimate itself.
     corners = _expected(fit, places, found.world)
     observed, left_out = observe(mended, found, crops, corners, fit.state.normals, fit.range_sigma_m)
     places, frame_scatter, dropped = _without_odd_frames(observed, corners, fit.state.normals, fit.range_sigma_m)
@@ -195,7 +200,7 @@ def _joint(
         session.lidar.range_sigma_m,
         session.cloud_frame,
         frame_scatter,
-        _turns(session, fits, fit.state.normals),
+        _turns(session, fits, fit, used),
     )
     quality = judge_corner_fit(fit, used, evidence, limits)
     calibration = WorldCalibration(
@@ -219,10 +224,21 @@ def _expected(fit: CornerFit, places: Sequence[CornerPlaceFaces], world: FloatAr
 
 
 def _turns(
-    session: CornerSession, fits: Sequence[FreeCorner | None], normals: FloatArray
+    session: CornerSession, fits: Sequence[FreeCorner | None], fit: CornerFit, used: Sequence[CornerPlaceFaces]
 ) -> dict[str, tuple[float, float]]:
-    """By place: how far its own faces are turned from the common ones, and how surely."""
-    return {p.position: f.turn_statistic(normals) for p, f in zip(session.places, fits, strict=True) if f is not None}
+    """By place: how far its own faces are turned from the common ones, and how surely.
+
+    Of the place's own fit, which follows a target however far it is turned, and of all returns, which see small turns.
+    """
+    turns = {
+        p.position: f.turn_statistic(fit.state.normals)
+        for p, f in zip(session.places, fits, strict=True)
+        if f is not None
+    }
+    for k, turn in own_turns(fit).items():
+        name = used[k].position
+        turns[name] = max(turn, turns.get(name, turn), key=lambda t: t[1])
+    return turns
 
 
 def _as_used(covariance: FloatArray, figures: Mapping[str, Any]) -> FloatArray:
@@ -301,8 +317,7 @@ def _without_odd_frames(
 
 
 def _frames_only(returns: FaceReturns, good: Any) -> FaceReturns:
-    keep = good[returns.frame]
-    return FaceReturns(returns.directions[keep], returns.range_m[keep], returns.frame[keep])
+    return returns.subset(np.flatnonzero(good[returns.frame]))
 
 
 def _fit(
@@ -315,7 +330,7 @@ def _fit(
     stated = session.world_sigma_m
     fit = fit_corner_model(used, start, sigma_m, CornerOptions(stated or 0.0, scale_too))
     if stated is None:
-        estimated, gain = estimate_world_sigma(used, fit)
+        estimated, gain = estimate_world_sigma(fit)
         if gain > CONVINCING_GAIN:
             fit = fit_corner_model(used, fit.state, fit.range_sigma_m, CornerOptions(estimated, scale_too))
     return fit, used
