@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+_REDRAWN_EVERY_S = 0.1
 
 
 class Advance(Protocol):
@@ -50,6 +53,16 @@ def progress(text: str, total: int | None, *, quiet: bool = False) -> Iterator[A
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=err(), transient=True) as bar:
+    # Drawn as work goes on, not by a thread of its own: a process with threads cannot be forked (workflows/forked.py).
+    with Progress(*columns, console=err(), transient=True, auto_refresh=False) as bar:
         task = bar.add_task(text, total=total)
-        yield lambda steps=1: bar.advance(task, steps)
+        drawn = time.monotonic()
+
+        def advance(steps: int = 1) -> None:
+            nonlocal drawn
+            bar.advance(task, steps)
+            if time.monotonic() - drawn > _REDRAWN_EVERY_S:
+                bar.refresh()
+                drawn = time.monotonic()
+
+        yield advance

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import chain, groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from lidarpose.model.sense import StatedSense
 from lidarpose.model.session import TurntablePlace, TurntableSession
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_run import Deviation, FunctionDeviation, Method, TruthError, TurntableRun
+from lidarpose.workflows.forked import copies_allowed, share
 from lidarpose.workflows.named_causes import with_cause_named
 from lidarpose.workflows.reversed_scans import Solved, doubt_reversed, reversed_part, reversed_scans
 from lidarpose.workflows.turning_sense import check_sense, compared, turning_sense
@@ -39,11 +40,20 @@ Step = Callable[[], None]
 """Called after each image or scan that is done, for a progress bar."""
 
 
+Batch = Sequence[TurntablePlace]
+"""Places whose images are searched together."""
+
+_Stripes = tuple[Mapping[int, StripePoints], list[LeftOut]]
+_Detected = tuple[Mapping[str, "BoardDetection"], Sequence[tuple[ScanLine, ...] | LeftOut], Sequence[_Stripes]]
+
 IMAGES_AT_ONCE = 8
 """Stripe images that are fitted together: enough that single ones cost little, few enough for memory and progress."""
 
 BATCHES_AHEAD = 4
 """So many batches of images are decoded while earlier ones are searched; more would only take memory."""
+
+LEAST_BATCHES = 3
+"""With fewer there is too little to share."""
 
 MOST_CONTRADICTING = 0.15
 """Share of the places with both stripes that may contradict the others before the whole is in doubt."""
@@ -216,43 +226,90 @@ def doubted(quality: Quality | None, features: DetectedFeatures, observations: T
 def detect_features(session: TurntableSession, *, step: Step | None = None) -> DetectedFeatures:
     """Boards, stripes and scan lines of a session (sections 1.2 to 1.4), on all cores.
 
-    Images are decoded ahead by threads of their own: decoding is most of the work, and leaves the interpreter free for
-    the rest, which is done here, place after place.
+    Where this process may be forked, copies of it take their share of the places; the result is the same without.
     """
     batches = _batches(session.places)
-    executor = ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1))
-    try:
-        decoded = _decoded_ahead(executor, batches)
-        boards, finders = {}, {}
-        for placement, sources in session.board_images.items():
-            boards[placement], finders[placement] = _detect_board(session, placement, [s.load() for s in sources])
-        places: list[PlaceFeatures] = []
-        left_out: list[LeftOut] = []
-        for batch in batches:
-            all_lines = [_find_scan_lines(session, place) for place in batch]
-            images = [None if image is None else image.result() for image in next(decoded)]
-            all_stripes = _find_stripes(finders[batch[0].placement], batch, images)
-            for place, lines, (stripes, problems) in zip(batch, all_lines, all_stripes, strict=True):
-                left_out += problems
-                if isinstance(lines, LeftOut):
-                    left_out.append(lines)
-                else:
-                    angle = place.turntable_angle_rad
-                    places.append(PlaceFeatures(place.position, angle, stripes, lines, place.placement))
-                if step is not None:
-                    step()
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
+    copies = copies_allowed() if len(batches) >= LEAST_BATCHES else 0
+    if copies == 0:
+        found = _detect_alone(session, batches, step)
+    else:
+        from lidarpose.detect.opencv_threads import one_opencv_thread
+
+        with one_opencv_thread():
+            found = _detect_with_copies(session, batches, copies, step)
+    boards, all_lines, all_stripes = found
+    places: list[PlaceFeatures] = []
+    left_out: list[LeftOut] = []
+    for place, lines, (stripes, problems) in zip(chain(*batches), all_lines, all_stripes, strict=True):
+        left_out += problems
+        if isinstance(lines, LeftOut):
+            left_out.append(lines)
+        else:
+            places.append(PlaceFeatures(place.position, place.turntable_angle_rad, stripes, lines, place.placement))
     notes = tuple(note for board in boards.values() for note in board.notes)
     return DetectedFeatures(boards, tuple(places), tuple(left_out), notes)
 
 
-def _decoded_ahead(
-    executor: ThreadPoolExecutor, batches: Sequence[Sequence[TurntablePlace]]
-) -> Iterator[list[Future[GrayImage] | None]]:
+def _detect_alone(session: TurntableSession, batches: Sequence[Batch], step: Step | None) -> _Detected:
+    """Boards, scan lines and stripes by this process alone.
+
+    Images are decoded ahead by threads of their own: decoding is most of the work, and leaves the interpreter free for
+    the rest, which is done here, place after place.
+    """
+    executor = ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1))
+    try:
+        decoded = _decoded_ahead(executor, batches)
+        boards, finders = _detect_boards(session)
+        lines = [_find_scan_lines(session, place) for batch in batches for place in batch]
+        stripes: list[_Stripes] = []
+        for batch in batches:
+            images = [None if image is None else image.result() for image in next(decoded)]
+            stripes += _find_stripes(finders[batch[0].placement], batch, images)
+            _advance(step, batch)
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+    return boards, lines, stripes
+
+
+def _detect_with_copies(
+    session: TurntableSession, batches: Sequence[Batch], copies: int, step: Step | None
+) -> _Detected:
+    """The same with the help of forked copies: scans while the boards are found, then images."""
+    found: list[tuple[Mapping[str, BoardDetection], Mapping[str, StripeFinder]]] = []
+    lines = share(
+        lambda k: [_find_scan_lines(session, place) for place in batches[k]],
+        len(batches),
+        copies=copies,
+        first=lambda: found.append(_detect_boards(session)),
+    )
+    boards, finders = found[0]
+
+    def search(k: int) -> list[_Stripes]:
+        images = [None if place.stripe_image is None else place.stripe_image.load() for place in batches[k]]
+        return _find_stripes(finders[batches[k][0].placement], batches[k], images)
+
+    stripes = share(search, len(batches), copies=copies, done=lambda k: _advance(step, batches[k]))
+    return boards, list(chain(*lines)), list(chain(*stripes))
+
+
+def _advance(step: Step | None, batch: Batch) -> None:
+    if step is not None:
+        for _ in batch:
+            step()
+
+
+def _detect_boards(session: TurntableSession) -> tuple[dict[str, BoardDetection], dict[str, StripeFinder]]:
+    """Board and stripe finder by placement."""
+    boards, finders = {}, {}
+    for placement, sources in session.board_images.items():
+        boards[placement], finders[placement] = _detect_board(session, placement, [s.load() for s in sources])
+    return boards, finders
+
+
+def _decoded_ahead(executor: ThreadPoolExecutor, batches: Sequence[Batch]) -> Iterator[list[Future[GrayImage] | None]]:
     """The stripe images of each batch, in order; `BATCHES_AHEAD` of them are on their way at any time."""
 
-    def start(batch: Sequence[TurntablePlace]) -> list[Future[GrayImage] | None]:
+    def start(batch: Batch) -> list[Future[GrayImage] | None]:
         return [None if p.stripe_image is None else executor.submit(p.stripe_image.load) for p in batch]
 
     # Not a generator from the first line on: decoding is to start now.
@@ -292,7 +349,7 @@ def _find_scan_lines(session: TurntableSession, place: TurntablePlace) -> tuple[
     return find_lines(scan, session.lidar) or LeftOut(f"position {place.position}", "its scan has no straight line")
 
 
-def _batches(places: Sequence[TurntablePlace]) -> list[Sequence[TurntablePlace]]:
+def _batches(places: Sequence[TurntablePlace]) -> list[Batch]:
     """Places in their order, some at a time, all of one placement of the board each time."""
     groups = [list(group) for _, group in groupby(places, key=lambda place: place.placement)]
     return [group[k : k + IMAGES_AT_ONCE] for group in groups for k in range(0, len(group), IMAGES_AT_ONCE)]
@@ -300,10 +357,10 @@ def _batches(places: Sequence[TurntablePlace]) -> list[Sequence[TurntablePlace]]
 
 def _find_stripes(
     finder: StripeFinder, places: Sequence[TurntablePlace], images: Sequence[GrayImage | None]
-) -> list[tuple[Mapping[int, StripePoints], list[LeftOut]]]:
+) -> list[_Stripes]:
     """Stripes of each place by panel, and what was given up."""
     detections = iter(finder.find_in([image for image in images if image is not None]))
-    found: list[tuple[Mapping[int, StripePoints], list[LeftOut]]] = []
+    found: list[_Stripes] = []
     for place, image in zip(places, images, strict=True):
         if image is None:
             found.append(({}, []))
