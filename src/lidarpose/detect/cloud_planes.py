@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarpose.detect.plane_claims import Slab, patches_of_slabs
+from lidarpose.detect.plane_raster import cell_size_m, grown, raster_of
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
 from lidarpose.geometry.robust import mad_sigma
@@ -23,6 +25,10 @@ from lidarpose.model.plane_patch import PlanePatch
 Float32Array = NDArray[np.float32]
 
 SAMPLE_SIZE = 4096
+# From this many points on, patches are found and tested in a subsample, and the whole cloud is asked once.
+DENSE = 100_000
+DENSE_SAMPLE = 16_384
+FEWEST_OF_SAMPLE = 30
 HYPOTHESES = 1000
 # Neighbourhoods of a hypothesis, in nearest points of the subsample and of a quarter of it: wide ones reach
 # across the gaps between the lines of a multi-beam LiDAR, narrow ones fit on small faces.
@@ -33,9 +39,6 @@ GATE_SIGMAS = 3.0
 MIN_SIGMA_M = 2e-4
 # A patch spreads more than its neighbourhoods say, by up to this factor; a wider slab would take in two surfaces.
 WIDEST = 3.0
-# A patch is connected across gaps of this share of its range, which spans the lines of a 16-beam LiDAR on a slope.
-GAP_PER_RANGE = 0.06
-MIN_GAP_M = 0.04
 # Of the voxels within twice a patch's thickness, the share that lies within it; and its thickness over its width.
 STANDS_OUT = 0.7
 THIN = 0.15
@@ -99,23 +102,67 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
     The patches, in the order found (roughly by size). No point belongs to two.
     """
     search = search or PlaneSearch()
-    x: Float32Array = np.ascontiguousarray(points, dtype=np.float32)
+    x = np.asarray(points)
     rng = np.random.default_rng(search.seed)
     least = max(search.min_points, int(search.min_share * len(x)))
     free = np.ones(len(x), dtype=bool)
     patches: list[PlanePatch] = []
     sigma_m: float | None = None
     for _ in range(search.max_rounds):
-        remaining = np.flatnonzero(free)
-        if len(remaining) < max(least, POINTS_PER_HYPOTHESIS) or len(patches) >= search.max_planes:
+        at_most = search.max_planes - len(patches)
+        count = int(np.count_nonzero(free))
+        if count < max(least, POINTS_PER_HYPOTHESIS) or at_most <= 0:
             break
-        sample = _draw(x, remaining, sigma_m, search.from_sensor, rng)
-        found = _harvest(x, free, sample, least, search.max_planes - len(patches))
+        if count > DENSE:
+            found = _harvest_dense(x, free, count, sigma_m, search, least, at_most, rng)
+        else:
+            x = np.ascontiguousarray(x, dtype=np.float32)
+            sample = _draw(x, np.flatnonzero(free), sigma_m, search.from_sensor, rng)
+            found = _harvest(x, free, sample, least, at_most)
         if not found:
             break
         patches += found
         sigma_m = float(np.median([p.sigma_m for p in patches]))
     return tuple(patches)
+
+
+def _harvest_dense(
+    x: NDArray[np.floating],
+    free: BoolArray,
+    count: int,
+    sigma_m: float | None,
+    search: PlaneSearch,
+    least: int,
+    at_most: int,
+    rng: np.random.Generator,
+) -> list[PlanePatch]:
+    """Patches of the `count` free points of a cloud so dense that a subsample shows them; the whole cloud is asked
+    once for all of them."""
+    chosen = _one_of_each(count, DENSE_SAMPLE, rng)
+    if count < len(x):
+        chosen = np.flatnonzero(free)[chosen]
+    few = x[chosen].astype(np.float32)
+    share = count / len(few)
+    fewest = max(int(least / share), FEWEST_OF_SAMPLE)
+    sample = _draw(few, _one_of_each(len(few), SAMPLE_SIZE, rng), sigma_m, search.from_sensor, rng)
+    seen = _harvest(few, np.ones(len(few), dtype=bool), sample, fewest, at_most)
+    slabs = [Slab.around(few[p.indices], p.plane, p.sigma_m) for p in seen]
+    found = []
+    for answer in patches_of_slabs(x, None if count == len(x) else free, slabs) if slabs else ():
+        if answer is None:
+            continue
+        patch, variances = answer
+        if len(patch) >= least and _is_thin(np.append(0.0, variances), patch.sigma_m):
+            free[patch.indices] = False
+            found.append(patch)
+    return found
+
+
+def _one_of_each(count: int, parts: int, rng: np.random.Generator) -> IntArray:
+    """One number at random out of each of `parts` like stretches of [0, count): as even as the cloud's own order."""
+    if count <= parts:
+        return np.arange(count)
+    return np.asarray(((np.arange(parts) + rng.random(parts)) * (count / parts)).astype(np.int64))
 
 
 def _draw(
@@ -238,40 +285,6 @@ def _moment_plane(points: NDArray[np.floating]) -> Plane:
     return Plane(normal, offset) if offset <= 0.0 else Plane(-normal, -offset)
 
 
-@dataclass(frozen=True, eq=False)
-class _Raster:
-    """A grid on a plane: cells of side `cell_m` along the axes (2, 3), counted from `origin` (2,)."""
-
-    axes: FloatArray
-    cell_m: float
-    origin: IntArray
-    shape: tuple[int, int]
-
-    def cells(self, points: NDArray[np.floating]) -> IntArray:
-        """Cells (M,) of points (M, 3) as flat numbers; -1 outside."""
-        scaled = (self.axes / self.cell_m).astype(points.dtype) @ points.T
-        u = np.floor(scaled[0]).astype(np.int64) - self.origin[0]
-        v = np.floor(scaled[1]).astype(np.int64) - self.origin[1]
-        inside = (u >= 0) & (u < self.shape[0]) & (v >= 0) & (v < self.shape[1])
-        return np.where(inside, u * self.shape[1] + v, -1)
-
-
-def _raster(points: NDArray[np.floating], plane: Plane, cell_m: float, border: int) -> _Raster:
-    from lidarpose.geometry.arrays import perpendicular_pair
-
-    axes = np.stack(perpendicular_pair(plane.normal))
-    uv = np.floor(points @ (axes.T / cell_m).astype(points.dtype)).astype(np.int64)
-    low, high = uv.min(axis=0) - border, uv.max(axis=0) + border + 1
-    shape = np.minimum(high - low, 4000)
-    return _Raster(axes, cell_m, low, (int(shape[0]), int(shape[1])))
-
-
-def gap_m(points: NDArray[np.floating]) -> float:
-    """The gap across which points (M, 3) of one surface still count as connected."""
-    ranges = np.sqrt(np.einsum("ij,ij->i", points, points))
-    return max(MIN_GAP_M, GAP_PER_RANGE * float(np.median(ranges)))
-
-
 def _largest_component(points: Float32Array, inside: BoolArray, plane: Plane) -> BoolArray:
     """Of the points `inside` (S,), those of the largest piece that hangs together across gaps, on the plane."""
     from scipy import ndimage
@@ -282,7 +295,7 @@ def _largest_component(points: Float32Array, inside: BoolArray, plane: Plane) ->
         return result
     chosen = points[members]
     # A thinned subsample has gaps of its own: twice the spacing that its own number and extent give.
-    raster = _raster(chosen, plane, _cell_size(chosen), 0)
+    raster = raster_of(chosen, plane, cell_size_m(chosen), 0)
     cells = raster.cells(chosen)
     occupied = np.bincount(cells[cells >= 0], minlength=raster.shape[0] * raster.shape[1]).reshape(raster.shape)
     labels, pieces = ndimage.label(occupied > 0, structure=np.ones((3, 3)))
@@ -295,21 +308,13 @@ def _largest_component(points: Float32Array, inside: BoolArray, plane: Plane) ->
     return result
 
 
-def _cell_size(chosen: Float32Array) -> float:
-    if len(chosen) < 4:
-        return gap_m(chosen)
-    variance = np.maximum(np.linalg.eigvalsh(np.cov(chosen.T.astype(np.float64))), 0.0)
-    area = 12.0 * float(np.sqrt(variance[1] * variance[2]))
-    return max(gap_m(chosen), 2.0 * float(np.sqrt(area / len(chosen))))
-
-
 def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, component: BoolArray) -> PlanePatch | None:
     """The patch on the full cloud: free points near the plane in the cells that the component occupies."""
     seen = sample.points[component]
-    raster = _raster(seen, plane, _cell_size(seen), 1)
+    raster = raster_of(seen, plane, cell_size_m(seen), 1)
     occupied = np.zeros(raster.shape[0] * raster.shape[1] + 1, dtype=bool)
     occupied[raster.cells(seen)] = True
-    allowed = np.append(_grown(occupied[:-1].reshape(raster.shape)).ravel(), False)
+    allowed = np.append(grown(occupied[:-1].reshape(raster.shape)).ravel(), False)
     # Twice the widest slab: what lies just outside it tells a plane from something else.
     reach = np.float32(2.0 * WIDEST * GATE_SIGMAS * sample.sigma_m)
     distance = x @ plane.normal.astype(np.float32) - np.float32(plane.offset)
@@ -403,13 +408,3 @@ def _spread(distance: Float32Array, first_sigma_m: float) -> float:
 def _is_thin(variances: FloatArray, sigma_m: float) -> bool:
     """Whether points with these variances extend both ways well beyond their spread across."""
     return bool(sigma_m**2 < 0.35**2 * variances[1] and sigma_m**2 < 0.1**2 * variances[2])
-
-
-def _grown(occupied: BoolArray) -> BoolArray:
-    grown = occupied.copy()
-    for axis in (0, 1):
-        before = grown.copy()
-        for step in (-1, 1):
-            shifted = np.roll(before, step, axis=axis)
-            grown |= shifted
-    return grown

@@ -1,0 +1,240 @@
+"""From patches of a subsample to patches of the whole cloud, all of them in one pass over its points.
+
+The pass goes through the cloud in blocks that stay in the cache. It keeps the points that lie near a patch's plane,
+in the cells of it that the subsample occupies, with their heights over it, and sums the moments that the plane's
+correction follows from. Points that two patches claim, along the seam of two faces, belong to the patch that was found
+first and have no say in either plane: on one side of a seam only, the other face's points would tilt it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarpose.detect.plane_raster import PlaneRaster, grown, raster_of, spacing_m
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
+from lidarpose.geometry.planes import Plane
+from lidarpose.geometry.robust import mad_sigma
+from lidarpose.model.plane_patch import PlanePatch
+
+Float32Array = NDArray[np.float32]
+
+# Points of a block: its coordinates, heights and masks stay in a core's cache.
+BLOCK = 1 << 15
+GATE_SIGMAS = 3.0
+# Claimed is a little more than is kept in the end, for planes and spreads that a subsample gives a little wrong.
+CLAIM_SIGMAS = 4.0
+# Heights around the gate, one sigma wide, that tell what enters and leaves as the plane moves.
+RIM_SIGMAS = (2.5, 3.5)
+# At most this share of the points' information may be at the gate; else it is no gate.
+MOST_AT_GATE = 0.5
+# A step of more than this many standard deviations of the result is followed by another.
+LARGE_STEP = 20.0
+MOST_STEPS = 4
+FEWEST = 6
+SPREAD_POINTS = 20_000
+# Of the terms 1, height, u, v.
+_ON_PLANE = [0, 2, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class Slab:
+    """A patch as a subsample shows it.
+
+    Attributes
+    ----------
+    plane, sigma_m
+        As fitted to the subsample's points.
+    raster, allowed
+        The cells of the plane that they occupy, and their neighbours; none on the raster's border.
+    rows : (6, 4)
+        Take (x, y, z, 1) to 1, the height over the plane, two coordinates on it from near the patch's middle, and the
+        two coordinates in cells of the raster.
+    """
+
+    plane: Plane
+    sigma_m: float
+    raster: PlaneRaster
+    allowed: BoolArray
+    rows: FloatArray
+
+    @staticmethod
+    def around(points: NDArray[np.floating], plane: Plane, sigma_m: float) -> Slab:
+        """The slab of a patch with points (M, 3)."""
+        raster = raster_of(points, plane, spacing_m(points), 2)
+        occupied = np.zeros(raster.shape[0] * raster.shape[1], dtype=bool)
+        cells = raster.cells(points)
+        occupied[cells[cells >= 0]] = True
+        allowed = grown(occupied.reshape(raster.shape))
+        allowed[[0, -1]] = allowed[:, [0, -1]] = False
+        middle = raster.axes @ points.mean(axis=0, dtype=np.float64)
+        rows = np.zeros((6, 4))
+        rows[0, 3] = 1.0
+        rows[1] = np.append(plane.normal, -plane.offset)
+        rows[2:4, :3], rows[2:4, 3] = raster.axes, -middle
+        rows[4:, :3], rows[4:, 3] = raster.axes / raster.cell_m, -raster.origin
+        return Slab(plane, sigma_m, raster, allowed.ravel(), rows)
+
+    def holds(self, cells: Float32Array) -> BoolArray:
+        """Which of points lie in allowed cells, by their coordinates (2, M) in cells, which are lost."""
+        high = np.array(self.raster.shape, dtype=np.float32)[:, None] - np.float32(1.0)
+        # What lies outside ends on the border, which is never allowed.
+        np.maximum(cells, np.float32(0.0), out=cells)
+        u, v = np.minimum(cells, high, out=cells).astype(np.int32)
+        u *= np.int32(self.raster.shape[1])
+        u += v
+        return np.asarray(self.allowed.take(u))
+
+    def leant(self, lean: FloatArray) -> Plane:
+        """The plane that has the heights lean . (1, u, v) over this one."""
+        turned = self.rows[1] - lean @ self.rows[[0, 2, 3]]
+        plane = Plane(turned[:3], -float(turned[3]))
+        return plane if plane.offset <= 0.0 else plane.flipped()
+
+
+@dataclass(frozen=True, eq=False)
+class _Claims:
+    """Points of a block near one patch: which (M,), their terms (1, height, u, v) (4, M), and which lie in a seam."""
+
+    indices: IntArray
+    terms: Float32Array
+    alone: BoolArray
+
+    def moments(self, rest: Float32Array, sigma_m: float) -> tuple[FloatArray, FloatArray]:
+        """Sums (4, 4) of the terms' products within the gate, and (3, 3) of (1, u, v) around it, by heights (M,)."""
+        apart = np.abs(rest)
+        inside = (apart < np.float32(GATE_SIGMAS * sigma_m)) & self.alone
+        low, high = (np.float32(s * sigma_m) for s in RIM_SIGMAS)
+        rim = self.terms.take(np.flatnonzero((apart > low) & (apart < high) & self.alone), axis=1)[_ON_PLANE]
+        return (self.terms * inside) @ self.terms.T, rim @ rim.T
+
+
+_Part = tuple[_Claims, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """What all blocks say of a slab: the plane's heights over the slab's, and the spread and extents of its points."""
+
+    lean: FloatArray
+    sigma_m: float
+    variances: FloatArray
+
+
+def patches_of_slabs(
+    x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab]
+) -> list[tuple[PlanePatch, FloatArray] | None]:
+    """The patches of the whole cloud for those of a subsample, in their order.
+
+    Parameters
+    ----------
+    x : (N, 3)
+    free
+        Which of them may be taken; None for all.
+
+    Returns
+    -------
+    For each slab the patch, and the variances (2,) of its points along it, ascending; None where too few points are
+    there. No point belongs to two.
+    """
+    blocks = [slice(first, min(first + BLOCK, len(x))) for first in range(0, len(x), BLOCK)]
+    workers = min(os.cpu_count() or 1, len(blocks))
+    with ThreadPoolExecutor(workers) as pool:
+        parts = list(pool.map(lambda block: _claim(x, free, slabs, block), blocks))
+    taken = np.zeros(len(x), dtype=bool)
+    patches: list[tuple[PlanePatch, FloatArray] | None] = []
+    for k, slab in enumerate(slabs):
+        fit = _fit(slab, [part[k] for part in parts])
+        if fit is None:
+            patches.append(None)
+            continue
+        indices = np.concatenate([_members(part[k][0], fit) for part in parts])
+        if patches:
+            indices = indices[~taken[indices]]
+        taken[indices] = True
+        patches.append((PlanePatch(slab.leant(fit.lean), indices, fit.sigma_m), fit.variances))
+    return patches
+
+
+def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab], block: slice) -> list[_Part]:
+    """What each slab claims of a block of the points."""
+    points = np.ones((4, block.stop - block.start), dtype=np.float32)
+    np.copyto(points[:3], x[block].T, casting="same_kind")
+    height = np.array([s.rows[1] for s in slabs], dtype=np.float32) @ points
+    near = np.abs(height, out=height) < np.array([[CLAIM_SIGMAS * s.sigma_m] for s in slabs], dtype=np.float32)
+    if free is not None:
+        near &= free[block]
+    found = []
+    for slab, mine in zip(slabs, near, strict=True):
+        indices = np.flatnonzero(mine)
+        terms = slab.rows.astype(np.float32) @ points.take(indices, axis=1)
+        held = slab.holds(terms[4:])
+        if held.all():
+            found.append((indices, terms[:4]))
+        else:
+            found.append((indices[held], terms[:4].compress(held, axis=1)))
+    # Slabs are endless, so that many points lie in two of them; claimed twice are those that both patches hold.
+    suspects = np.add.reduce(near, axis=0, dtype=np.uint8) > 1
+    claims = np.zeros(len(suspects), dtype=np.uint8)
+    for indices, _ in found:
+        claims[indices[suspects.take(indices)]] += 1
+    out = []
+    for slab, (indices, terms) in zip(slabs, found, strict=True):
+        mine = _Claims(indices + block.start, terms, claims.take(indices) < 2)
+        out.append((mine, *mine.moments(terms[1], slab.sigma_m)))
+    return out
+
+
+def _fit(slab: Slab, parts: Sequence[_Part]) -> _Fit | None:
+    """Least squares of the heights within three sigmas of the plane itself, by Newton's method from the subsample's.
+
+    That plane is right to a small fraction of a sigma, so that heights over it are distances.
+    """
+    claims = [part[0] for part in parts]
+    sums = [part[1:] for part in parts]
+    lean: FloatArray = np.zeros(3)
+    for _ in range(MOST_STEPS):
+        moments, rim = (np.asarray(np.sum(each, axis=0, dtype=np.float64)) for each in zip(*sums, strict=True))
+        count = moments[0, 0]
+        if count < FEWEST:
+            return None
+        plain = moments[np.ix_(_ON_PLANE, _ON_PLANE)]
+        variances = np.linalg.eigvalsh(plain[1:, 1:] / count - np.outer(plain[0, 1:], plain[0, 1:]) / count**2)
+        if not variances[0] > 0.0:
+            return None
+        step = _newton_step(plain, rim, moments[_ON_PLANE, 1] - plain @ lean)
+        lean = lean + step
+        if step @ plain @ step < (LARGE_STEP * slab.sigma_m) ** 2:
+            break
+        sums = [claim.moments(_rest(claim.terms, lean), slab.sigma_m) for claim in claims]
+    every = int(count) // SPREAD_POINTS + 1
+    rest = np.concatenate([_rest(claim.terms[:, ::every], lean) for claim in claims])
+    rest = rest[np.abs(rest) < GATE_SIGMAS * slab.sigma_m]
+    return _Fit(lean, max(mad_sigma(rest, centred=True), 0.5 * slab.sigma_m), variances)
+
+
+def _newton_step(plain: FloatArray, rim: FloatArray, gradient: FloatArray) -> FloatArray:
+    """By how much (3,) the plane has to lean so that the heights within the gate have no trend.
+
+    A plane that moves by h takes in h times the density of points at one side of the gate and loses as much at the
+    other, each three sigmas off: without that a step would fall short, by a fortieth in clean surroundings.
+    """
+    width = RIM_SIGMAS[1] - RIM_SIGMAS[0]
+    at_gate = rim * (GATE_SIGMAS / width)
+    share = float(np.abs(np.linalg.eigvals(np.linalg.solve(plain, at_gate))).max())
+    return np.asarray(np.linalg.solve(plain - at_gate * min(1.0, MOST_AT_GATE / max(share, 1e-9)), gradient))
+
+
+def _rest(terms: Float32Array, lean: FloatArray) -> Float32Array:
+    """Heights over the leant plane."""
+    return np.array([-lean[0], 1.0, -lean[1], -lean[2]], dtype=np.float32) @ terms
+
+
+def _members(claims: _Claims, fit: _Fit) -> IntArray:
+    """Indices of the points within three sigmas of the plane."""
+    return claims.indices[np.abs(_rest(claims.terms, fit.lean)) < np.float32(GATE_SIGMAS * fit.sigma_m)]

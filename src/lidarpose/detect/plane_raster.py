@@ -1,0 +1,71 @@
+"""Where on its plane a patch lies: a raster of occupied cells, and the size of cells across which a patch hangs
+together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, perpendicular_pair
+from lidarpose.geometry.planes import Plane
+
+# A patch is connected across gaps of this share of its range, which spans the lines of a 16-beam LiDAR on a slope.
+GAP_PER_RANGE = 0.06
+MIN_GAP_M = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneRaster:
+    """A grid on a plane: cells of side `cell_m` along the axes (2, 3), counted from `origin` (2,)."""
+
+    axes: FloatArray
+    cell_m: float
+    origin: IntArray
+    shape: tuple[int, int]
+
+    def cells(self, points: NDArray[np.floating]) -> IntArray:
+        """Cells (M,) of points (M, 3) as flat numbers; -1 outside."""
+        scaled = (self.axes / self.cell_m).astype(points.dtype) @ points.T
+        u = np.floor(scaled[0]).astype(np.int64) - self.origin[0]
+        v = np.floor(scaled[1]).astype(np.int64) - self.origin[1]
+        inside = (u >= 0) & (u < self.shape[0]) & (v >= 0) & (v < self.shape[1])
+        return np.where(inside, u * self.shape[1] + v, -1)
+
+
+def raster_of(points: NDArray[np.floating], plane: Plane, cell_m: float, border: int) -> PlaneRaster:
+    axes = np.stack(perpendicular_pair(plane.normal))
+    uv = np.floor(points @ (axes.T / cell_m).astype(points.dtype)).astype(np.int64)
+    low, high = uv.min(axis=0) - border, uv.max(axis=0) + border + 1
+    shape = np.minimum(high - low, 4000)
+    return PlaneRaster(axes, cell_m, low, (int(shape[0]), int(shape[1])))
+
+
+def gap_m(points: NDArray[np.floating]) -> float:
+    """The gap across which points (M, 3) of one surface still count as connected."""
+    ranges = np.sqrt(np.einsum("ij,ij->i", points, points))
+    return max(MIN_GAP_M, GAP_PER_RANGE * float(np.median(ranges)))
+
+
+def cell_size_m(points: NDArray[np.floating]) -> float:
+    """Side of cells in which points (M, 3) of one surface hang together: a thinned cloud has gaps of its own."""
+    return max(gap_m(points), spacing_m(points))
+
+
+def spacing_m(points: NDArray[np.floating]) -> float:
+    """Twice the distance between neighbours that the number of points (M, 3) on a plane and their extents give."""
+    if len(points) < 4:
+        return 0.0
+    variance = np.maximum(np.linalg.eigvalsh(np.cov(points.T.astype(np.float64))), 0.0)
+    return 2.0 * float((12.0**2 * variance[1] * variance[2]) ** 0.25 / np.sqrt(len(points)))
+
+
+def grown(occupied: BoolArray) -> BoolArray:
+    grown = occupied.copy()
+    for axis in (0, 1):
+        before = grown.copy()
+        for step in (-1, 1):
+            shifted = np.roll(before, step, axis=axis)
+            grown |= shifted
+    return grown
