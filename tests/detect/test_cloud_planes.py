@@ -57,11 +57,13 @@ def test_scattered_points_have_no_planes_and_few_points_no_answer() -> None:
     assert segment_planes(rng.normal(size=(5, 3))) == ()
 
 
-def scanner_that_sees_its_mount(seed: int) -> tuple[FloatArray, FloatArray]:
+def scanner_that_sees_its_mount(seed: int, step_deg: tuple[float, float] = (0.5, 2.0)) -> tuple[FloatArray, FloatArray]:
     """A half-plane scanner that turns about the vertical in a room, 8 mm noise; and which points are of its mount,
     a round foot 0.11 m below it, where all sweeps meet, with smears out to the room's floor."""
     rng = np.random.default_rng(seed)
-    elevation, azimuth = np.radians(np.meshgrid(np.arange(-89.9, 90.0, 0.5), np.arange(0.3, 360.0, 2.0)))
+    elevation, azimuth = np.radians(
+        np.meshgrid(np.arange(-89.9, 90.0, step_deg[0]), np.arange(0.3, 360.0, step_deg[1]))
+    )
     d = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1)
     d = d.reshape(-1, 3)
     room = np.where(d > 0, np.array([2.5, 3.0, 1.7]) / d, np.array([-2.0, -1.5, -1.3]) / d).min(axis=1)
@@ -96,3 +98,12 @@ def test_the_target_is_told_from_clutter_by_its_moves(target: Any, lidar: Any) -
     for here, k, corner in zip(candidates, matches[0].choice, truth.corners_lidar, strict=True):
         assert k is not None
         assert np.linalg.norm(here[k].corner - corner) < 0.04
+
+
+def test_the_mount_is_no_plane_in_a_dense_cloud_either() -> None:
+    points, mount = scanner_that_sees_its_mount(0, step_deg=(0.2, 1.0))
+    assert len(points) > 300_000
+    patches = segment_planes(points, PlaneSearch(from_sensor=True))
+    assert sum(len(p) > 9000 for p in patches) == 6
+    for patch in patches:
+        assert np.count_nonzero(mount[patch.indices]) < 0.05 * np.count_nonzero(mount)

@@ -26,7 +26,7 @@ def test_the_plane_is_that_of_least_squares_over_all_points(dtype: type) -> None
     points = face(90_000, np.random.default_rng(1)) + [5.0, -3.0, 2.0]
     answer = patches_of_slabs(points.astype(dtype), None, [rough(points, 1)])[0]
     assert answer is not None
-    patch, variances = answer
+    patch, variances = answer.patch, answer.variances
     best = fit_plane(points[np.abs(points[:, 2] - 2.0) < 3.0 * SIGMA_M])
     # A tenth of the standard deviation that 90 000 points leave.
     assert angle_between(patch.plane.normal, best.flipped().normal if best.offset > 0 else best.normal) < 6e-6
@@ -44,7 +44,7 @@ def test_a_step_reaches_the_estimate_among_clutter_too() -> None:
     slab = Slab.around(points[:400], start, SIGMA_M)
     answer = patches_of_slabs(points, None, [slab])[0]
     assert answer is not None
-    plane = answer[0].plane if answer[0].plane.normal[2] > 0 else answer[0].plane.flipped()
+    plane = answer.patch.plane if answer.patch.plane.normal[2] > 0 else answer.patch.plane.flipped()
     # The same estimate by brute force, taken to its end.
     end = start
     for _ in range(60):
@@ -64,12 +64,12 @@ def test_points_along_a_seam_tilt_neither_plane_and_belong_to_one() -> None:
     normals = []
     for answer in answers:
         assert answer is not None
-        normals.append(answer[0].plane.normal * np.sign(answer[0].plane.normal.sum()))
+        normals.append(answer.patch.plane.normal * np.sign(answer.patch.plane.normal.sum()))
     # Three standard deviations that 60 000 points leave, of the tilt about the long side; with the seam it is five.
     limit = 3.0 * SIGMA_M / np.sqrt(60_000 / 12.0)
     assert angle_between(normals[0], np.array([0.0, 0.0, 1.0])) < limit
     assert angle_between(normals[1], np.array([1.0, 0.0, 0.0])) < limit
-    first, second = (answer[0].indices for answer in answers if answer is not None)
+    first, second = (answer.patch.indices for answer in answers if answer is not None)
     assert len(np.intersect1d(first, second)) == 0
     assert np.all(np.diff(first) > 0)
 
@@ -82,8 +82,8 @@ def test_only_free_points_are_taken_and_too_few_are_no_patch() -> None:
     free[::5] = True
     answer = patches_of_slabs(points, free, [slab])[0]
     assert answer is not None
-    assert free[answer[0].indices].all()
-    assert len(answer[0]) == pytest.approx(10_000, rel=0.01)
+    assert free[answer.patch.indices].all()
+    assert len(answer.patch) == pytest.approx(10_000, rel=0.01)
 
 
 def test_what_lies_beside_the_patch_on_its_plane_is_not_of_it() -> None:
@@ -91,4 +91,4 @@ def test_what_lies_beside_the_patch_on_its_plane_is_not_of_it() -> None:
     points = np.concatenate([face(30_000, rng), face(30_000, rng) + [3.0, 0.0, 0.0]])
     answer = patches_of_slabs(points, None, [rough(points[:30_000], 6)])[0]
     assert answer is not None
-    assert answer[0].indices.max() < 30_000
+    assert answer.patch.indices.max() < 30_000

@@ -29,6 +29,7 @@ SAMPLE_SIZE = 4096
 DENSE = 100_000
 DENSE_SAMPLE = 16_384
 FEWEST_OF_SAMPLE = 30
+ENOUGH_EVIDENCE = 2000
 HYPOTHESES = 1000
 # Neighbourhoods of a hypothesis, in nearest points of the subsample and of a quarter of it: wide ones reach
 # across the gaps between the lines of a multi-beam LiDAR, narrow ones fit on small faces.
@@ -147,14 +148,23 @@ def _harvest_dense(
     sample = _draw(few, _one_of_each(len(few), SAMPLE_SIZE, rng), sigma_m, search.from_sensor, rng)
     seen = _harvest(few, np.ones(len(few), dtype=bool), sample, fewest, at_most)
     slabs = [Slab.around(few[p.indices], p.plane, p.sigma_m) for p in seen]
+    if not slabs:
+        return []
     found = []
-    for answer in patches_of_slabs(x, None if count == len(x) else free, slabs) if slabs else ():
-        if answer is None:
+    claims = patches_of_slabs(x, None if count == len(x) else free, slabs, WIDEST * sample.sigma_m)
+    for before, claim in zip(seen, claims, strict=True):
+        if claim is None or len(claim.patch) < least:
             continue
-        patch, variances = answer
-        if len(patch) >= least and _is_thin(np.append(0.0, variances), patch.sigma_m):
-            free[patch.indices] = False
-            found.append(patch)
+        patch = claim.patch
+        if not _is_thin(np.append(0.0, claim.variances), patch.sigma_m):
+            continue
+        # Few voxels of the subsample say little of what a patch is: the cloud has more.
+        if len(_one_a_voxel(few[before.indices], GATE_SIGMAS * before.sigma_m)) < ENOUGH_EVIDENCE:
+            local = x[claim.around].astype(np.float32)
+            if not _stands_out(local, patch.plane.normal, patch.plane.offset, patch.sigma_m):
+                continue
+        free[patch.indices] = False
+        found.append(patch)
     return found
 
 

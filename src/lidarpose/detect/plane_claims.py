@@ -27,8 +27,9 @@ Float32Array = NDArray[np.float32]
 # Points of a block: its coordinates, heights and masks stay in a core's cache.
 BLOCK = 1 << 15
 GATE_SIGMAS = 3.0
-# Claimed is a little more than is kept in the end, for planes and spreads that a subsample gives a little wrong.
-CLAIM_SIGMAS = 4.0
+# Claimed is more than is kept in the end: what lies around a slab tells whether it is a surface.
+CLAIM_SIGMAS = 6.0
+EVIDENCE_POINTS = 8000
 # Heights around the gate, one sigma wide, that tell what enters and leaves as the plane moves.
 RIM_SIGMAS = (2.5, 3.5)
 # At most this share of the points' information may be at the gate; else it is no gate.
@@ -126,9 +127,28 @@ class _Fit:
     variances: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class Claim:
+    """A patch of the whole cloud.
+
+    Attributes
+    ----------
+    patch
+        Its plane, points and spread.
+    variances : (2,)
+        Of its points along it, ascending.
+    around : (M,)
+        Indices of some thousand of the points on it and up to twice as far off it, evenly drawn.
+    """
+
+    patch: PlanePatch
+    variances: FloatArray
+    around: IntArray
+
+
 def patches_of_slabs(
-    x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab]
-) -> list[tuple[PlanePatch, FloatArray] | None]:
+    x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab], widest_m: float = np.inf
+) -> list[Claim | None]:
     """The patches of the whole cloud for those of a subsample, in their order.
 
     Parameters
@@ -136,20 +156,21 @@ def patches_of_slabs(
     x : (N, 3)
     free
         Which of them may be taken; None for all.
+    widest_m
+        No patch spreads more.
 
     Returns
     -------
-    For each slab the patch, and the variances (2,) of its points along it, ascending; None where too few points are
-    there. No point belongs to two.
+    For each slab its patch; None where too few points are there. No point belongs to two.
     """
     blocks = [slice(first, min(first + BLOCK, len(x))) for first in range(0, len(x), BLOCK)]
     workers = min(os.cpu_count() or 1, len(blocks))
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda block: _claim(x, free, slabs, block), blocks))
     taken = np.zeros(len(x), dtype=bool)
-    patches: list[tuple[PlanePatch, FloatArray] | None] = []
+    patches: list[Claim | None] = []
     for k, slab in enumerate(slabs):
-        fit = _fit(slab, [part[k] for part in parts])
+        fit = _fit(slab, [part[k] for part in parts], widest_m)
         if fit is None:
             patches.append(None)
             continue
@@ -157,7 +178,9 @@ def patches_of_slabs(
         if patches:
             indices = indices[~taken[indices]]
         taken[indices] = True
-        patches.append((PlanePatch(slab.leant(fit.lean), indices, fit.sigma_m), fit.variances))
+        around = np.concatenate([part[k][0].indices for part in parts])
+        around = around[:: len(around) // EVIDENCE_POINTS + 1]
+        patches.append(Claim(PlanePatch(slab.leant(fit.lean), indices, fit.sigma_m), fit.variances, around))
     return patches
 
 
@@ -190,7 +213,7 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
     return out
 
 
-def _fit(slab: Slab, parts: Sequence[_Part]) -> _Fit | None:
+def _fit(slab: Slab, parts: Sequence[_Part], widest_m: float) -> _Fit | None:
     """Least squares of the heights within three sigmas of the plane itself, by Newton's method from the subsample's.
 
     That plane is right to a small fraction of a sigma, so that heights over it are distances.
@@ -215,7 +238,8 @@ def _fit(slab: Slab, parts: Sequence[_Part]) -> _Fit | None:
     every = int(count) // SPREAD_POINTS + 1
     rest = np.concatenate([_rest(claim.terms[:, ::every], lean) for claim in claims])
     rest = rest[np.abs(rest) < GATE_SIGMAS * slab.sigma_m]
-    return _Fit(lean, max(mad_sigma(rest, centred=True), 0.5 * slab.sigma_m), variances)
+    sigma_m = min(max(mad_sigma(rest, centred=True), 0.5 * slab.sigma_m), widest_m)
+    return _Fit(lean, sigma_m, variances)
 
 
 def _newton_step(plain: FloatArray, rim: FloatArray, gradient: FloatArray) -> FloatArray:
