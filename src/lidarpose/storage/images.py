@@ -11,9 +11,9 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.model.image import GrayImage
 from lidarpose.storage.limits import file_size
+from lidarpose.storage.png import SIGNATURE, PngHeader, decode_fast, png_header
 
 MAX_PIXELS = 2**27
-_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,14 @@ class FileImage:
         """
         # Raw 16-bit colour with transparency takes eight bytes a pixel; nothing of the camera's takes more.
         data = _read_bytes(self.path, 9 * self.width * self.height + 2**20)
-        size = png_size(self.path, data) if data.startswith(_PNG) else other_size(data)
+        header = png_header(self.path, data) if data.startswith(SIGNATURE) else None
+        size = other_size(data) if header is None else (header.width, header.height)
         if size is None:
             raise InputError(self.path, "is of no known kind", expected="a PNG, BMP, TIFF or JPEG image")
         self._check_size(*size)
         if size[0] * size[1] > MAX_PIXELS:
             raise InputError(self.path, f"has {size[0]} x {size[1]} pixels", expected=f"at most {MAX_PIXELS} in all")
-        image = _decode(self.path, data)
+        image = _decode(self.path, data, header)
         self._check_size(image.shape[1], image.shape[0])
         return image
 
@@ -73,13 +74,14 @@ def decode_image(path: Path, data: bytes, *, where: str | None = None) -> GrayIm
     InputError
         If the bytes are no whole image, of a kind whose size is not known beforehand, or of too many pixels.
     """
-    size = png_size(path, data) if data.startswith(_PNG) else other_size(data)
+    header = png_header(path, data) if data.startswith(SIGNATURE) else None
+    size = other_size(data) if header is None else (header.width, header.height)
     if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
         found = "is of no known kind" if size is None else f"has {size[0]} x {size[1]} pixels"
         raise InputError(
             path, f"an image {found}", field=where, expected=f"PNG, JPEG, TIFF or BMP of at most {MAX_PIXELS} pixels"
         )
-    return _decode(path, data)
+    return _decode(path, data, header)
 
 
 def _read_bytes(path: Path, limit: int) -> bytes:
@@ -92,7 +94,10 @@ def _read_bytes(path: Path, limit: int) -> bytes:
         raise InputError(path, f"cannot be read: {error.strerror or error}", expected="an image") from error
 
 
-def _decode(path: Path, data: bytes) -> GrayImage:
+def _decode(path: Path, data: bytes, header: PngHeader | None) -> GrayImage:
+    plain = None if header is None else decode_fast(data, header)
+    if plain is not None:
+        return plain
     import cv2
 
     image = None
@@ -106,18 +111,6 @@ def _decode(path: Path, data: bytes) -> GrayImage:
             path, "cannot be decoded", expected="a PNG, BMP, TIFF or JPEG image of 8 or 16 bit", remedy="Copy it again."
         )
     return np.asarray(image, np.uint8) if image.dtype == np.uint8 else np.asarray(image, np.uint16)
-
-
-def png_size(path: Path, data: bytes) -> tuple[int, int]:
-    """Width and height of a PNG, after a look whether its chunks are all there."""
-    offset = len(_PNG)
-    while offset + 12 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, offset)
-        offset += 12 + length
-        if kind == b"IEND" and offset <= len(data):
-            width, height = struct.unpack_from(">II", data, len(_PNG) + 8)
-            return int(width), int(height)
-    raise InputError(path, "is cut off", expected="a whole PNG image", remedy="Copy or record it again.")
 
 
 def other_size(data: bytes) -> tuple[int, int] | None:
