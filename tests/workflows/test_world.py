@@ -11,6 +11,7 @@ from lidarpose.geometry.se3 import Pose
 from lidarpose.model.calibration import WorldCalibration
 from lidarpose.model.corner_session import CornerSession
 from lidarpose.simulate.corner_scene import CornerSceneSpec, CornerTruth, paper_rotation, simulate_corner_session
+from lidarpose.workflows.moving_target import find_by_motion
 from lidarpose.workflows.world import LocatedTarget, calibrate_world, locate_target
 
 Simulated = tuple[CornerSession, CornerTruth, LocatedTarget]
@@ -131,3 +132,16 @@ def test_hints_give_the_same_answer(simulated: Simulated) -> None:
     )
     result = calibrate_world(replace(session, places=hinted))
     assert result.T_world_source.distance(truth.T_world_lidar)[0] < 1e-3
+
+
+def test_what_moves_gives_the_same_corners_as_the_full_search(simulated: Simulated) -> None:
+    session, truth, _ = simulated
+    world = np.stack([p.corner_world for p in session.places])
+    found = find_by_motion(session, world)
+    assert found is not None
+    for candidate, corner in zip(found, truth.corners_lidar, strict=True):
+        assert np.linalg.norm(candidate.corner - corner) < 0.02
+    # A place recorded before the target was moved shows the last place's: nobody is at its own.
+    places = list(session.places)
+    places[1] = replace(places[1], clouds=places[3].clouds)
+    assert find_by_motion(replace(session, places=tuple(places)), world) is None

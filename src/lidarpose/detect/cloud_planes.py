@@ -67,6 +67,8 @@ class PlaneSearch:
     from_sensor
         The origin is where the sensor stands. Then planes seen edge-on are no surfaces: each scan line of a multi-beam
         LiDAR lies in one.
+    hypotheses
+        Planes tried on each subsample.
     """
 
     max_planes: int = 40
@@ -75,6 +77,7 @@ class PlaneSearch:
     max_rounds: int = 6
     from_sensor: bool = False
     seed: int = 0
+    hypotheses: int = HYPOTHESES
 
 
 @dataclass(eq=False)
@@ -118,7 +121,7 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
             found = _harvest_dense(x, free, count, sigma_m, search, least, at_most, rng)
         else:
             x = np.ascontiguousarray(x, dtype=np.float32)
-            sample = _draw(x, np.flatnonzero(free), sigma_m, search.from_sensor, rng)
+            sample = _draw(x, np.flatnonzero(free), sigma_m, search, rng)
             found = _harvest(x, free, sample, least, at_most)
         if not found:
             break
@@ -145,7 +148,7 @@ def _harvest_dense(
     few = x[chosen].astype(np.float32)
     share = count / len(few)
     fewest = max(int(least / share), FEWEST_OF_SAMPLE)
-    sample = _draw(few, _one_of_each(len(few), SAMPLE_SIZE, rng), sigma_m, search.from_sensor, rng)
+    sample = _draw(few, _one_of_each(len(few), SAMPLE_SIZE, rng), sigma_m, search, rng)
     seen = _harvest(few, np.ones(len(few), dtype=bool), sample, fewest, at_most)
     slabs = [Slab.around(few[p.indices], p.plane, p.sigma_m) for p in seen]
     if not slabs:
@@ -176,7 +179,7 @@ def _one_of_each(count: int, parts: int, rng: np.random.Generator) -> IntArray:
 
 
 def _draw(
-    x: Float32Array, remaining: IntArray, sigma_m: float | None, from_sensor: bool, rng: np.random.Generator
+    x: Float32Array, remaining: IntArray, sigma_m: float | None, search: PlaneSearch, rng: np.random.Generator
 ) -> _Sample:
     """Draw a subsample of the remaining points, and hypotheses around random points of it."""
     if len(remaining) > SAMPLE_SIZE:
@@ -185,13 +188,13 @@ def _draw(
     else:
         indices = remaining
     points = x[indices]
-    count = min(HYPOTHESES, 4 * len(points))
+    count = min(search.hypotheses, 4 * len(points))
     thinned = points[rng.random(len(points)) < 1.0 / THINNED]
     chosen = _neighbourhoods(points, count // 2, rng)
     if len(thinned) >= POINTS_PER_HYPOTHESIS:
         chosen = np.concatenate([chosen, _neighbourhoods(thinned, count // 2, rng)])
     planes, thickness, flat = _local_planes(chosen)
-    if from_sensor:
+    if search.from_sensor:
         flat &= np.abs(planes[:, 3]) > EDGE_ON * np.linalg.norm(chosen.mean(axis=1), axis=1)
     if sigma_m is None:
         sigma_m = _noise_from_neighbourhoods(thickness[flat])

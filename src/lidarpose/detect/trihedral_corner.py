@@ -264,7 +264,7 @@ class FaceMask:
         `height` (3, N) are their projections onto the three normals.
         """
         normal = self.normals[face]
-        good = _in_outline(on_face, self.outlines[face], normal, 0.02)
+        good = in_outline(on_face, self.outlines[face], normal, 0.02)
         for k in range(3):
             if k != face:
                 # Distance from the common edge, along this face.
@@ -276,7 +276,7 @@ class FaceMask:
         return good
 
 
-def _in_outline(points: FloatArray, outline: FloatArray, normal: FloatArray, slack_m: float) -> BoolArray:
+def in_outline(points: FloatArray, outline: FloatArray, normal: FloatArray, slack_m: float) -> BoolArray:
     """Which points (3, N) of a plane lie in a convex outline (K, 3), widened by `slack_m`."""
     edges = np.roll(outline, -1, axis=0) - outline
     inward = np.cross(normal, edges)

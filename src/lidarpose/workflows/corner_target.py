@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.detect.trihedral_corner import FaceMask, find_corners
-from lidarpose.errors import InputError, UndeterminedError
+from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import NEAR_RADIUS_M, CloudSource, CornerPlace, CornerSession
@@ -27,10 +27,10 @@ from lidarpose.solve.corner_matching import (
     match_corners,
     nearest_strays,
 )
+from lidarpose.workflows.moving_target import MIN_FACE_RETURNS, find_by_motion, load_points
 
 # A hint is right within 0.3 m, and a target no larger than this beyond the corner.
 HINT_CROP_M = 1.5
-MIN_FACE_RETURNS = 12
 # A face in a single frame: at the first look, and at later ones where no target was found.
 FACE_RETURNS, FEWEST_FACE_RETURNS = 30, 15
 LOOKS = 4
@@ -138,18 +138,11 @@ def check_layout(session: CornerSession) -> None:
         )
 
 
-def load_points(source: CloudSource) -> FloatArray:
-    """A frame's finite points (N, 3), as stored. Raises InputError if there are too few to see anything in."""
-    points = source.load().finite().points
-    if len(points) < 3 * MIN_FACE_RETURNS:
-        raise InputError(
-            source.name, f"holds {len(points)} points with coordinates", expected="a frame that shows the target"
-        )
-    return points
-
-
 def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: None) -> FoundTarget:
     """Find the target in the first frame of each place, near its hint or unaided.
+
+    First by what moves: where the target is the same at all places, nothing else has to be looked at. Else, or if
+    anything is odd about the coordinates, by all corners of all places.
 
     Raises
     ------
@@ -158,6 +151,13 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
     """
     check_layout(session)
     world = world_coordinates(session)
+    quick = find_by_motion(session, world, seed=seed)
+    if quick is not None:
+        for _ in session.places:
+            tick()
+        matches = match_corners([[c] for c in quick], world)
+        if matches and matches[0].places == len(world):
+            return _found(session, [[c] for c in quick], matches, world, "")
 
     def corners_at(place: CornerPlace) -> tuple[CornerCandidate, ...]:
         found = place_corners(place, seed)
@@ -179,6 +179,16 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
         matches, world, oddity = _match_with_mistakes(candidates, world_coordinates(session), session.estimate_scale)
     if not matches:
         raise _not_found(session, candidates)
+    return _found(session, candidates, matches, world, oddity)
+
+
+def _found(
+    session: CornerSession,
+    candidates: Sequence[Sequence[CornerCandidate]],
+    matches: Sequence[CornerMatch],
+    world: FloatArray,
+    oddity: str,
+) -> FoundTarget:
     best = matches[0]
     sightings = tuple(
         None if k is None else _reordered(here[k], order)

@@ -56,6 +56,7 @@ JOINT_WHISKER = 3.0
 MIN_FRAMES_FOR_BOX_PLOT = 5
 # Returns around the target, of all frames of a place together, from which the first estimate is made.
 FIRST_RETURNS = 6000
+SMALL_TURN_RAD = np.radians(3.0)
 # Twice the gain in log likelihood at which uncertain world coordinates are believed in.
 CONVINCING_GAIN = 9.0
 
@@ -228,16 +229,15 @@ def _turns(
 ) -> dict[str, tuple[float, float]]:
     """By place: how far its own faces are turned from the common ones, and how surely.
 
-    Of the place's own fit, which follows a target however far it is turned, and of all returns, which see small turns.
+    Small turns by all returns that met the common faces; far-turned faces lose theirs, and the place's own fit, which
+    follows a target however far it is turned, tells.
     """
-    turns = {
-        p.position: f.turn_statistic(fit.state.normals)
-        for p, f in zip(session.places, fits, strict=True)
-        if f is not None
-    }
-    for k, turn in own_turns(fit).items():
-        name = used[k].position
-        turns[name] = max(turn, turns.get(name, turn), key=lambda t: t[1])
+    small = {used[k].position: turn for k, turn in own_turns(fit).items()}
+    turns = {}
+    for place, own in zip(session.places, fits, strict=True):
+        if own is not None:
+            turn = own.turn_statistic(fit.state.normals)
+            turns[place.position] = turn if turn[0] > SMALL_TURN_RAD else small.get(place.position, turn)
     return turns
 
 
