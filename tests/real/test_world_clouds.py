@@ -94,15 +94,6 @@ def room() -> FloatArray:
     return np.asarray(read_cloud(folder("rot2d_pcl") / "room_scan1.pcd").finite().points.astype(np.float64))
 
 
-def with_elevation_zero(points: FloatArray, offset_rad: float) -> FloatArray:
-    """The points of a scanner whose beam angles were read off by `offset_rad`."""
-    ranges = np.linalg.norm(points, axis=1)
-    elevation = np.arcsin(points[:, 2] / ranges) + offset_rad
-    azimuth = np.arctan2(points[:, 1], points[:, 0])
-    flat = ranges * np.cos(elevation)
-    return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)])
-
-
 def test_a_room_from_a_rotating_2d_scanner() -> None:
     # A third of the returns are the scanner's own mount, within half a metre: no plane may come of it.
     points = room()
@@ -114,17 +105,6 @@ def test_a_room_from_a_rotating_2d_scanner() -> None:
         assert np.median(off) < 1.6
         assert off.max() < 3.0
         assert has_room_corner(points, patches)
-
-
-@pytest.mark.slow
-def test_what_bends_that_room_is_the_scanners_zero() -> None:
-    # Its ceiling is a flat cone. The zero of the beam angle that makes most of the ceiling one plane, looked for by
-    # that alone, makes the room square too.
-    points = room()
-    offsets = np.radians([0.0, 0.75, 1.5, 2.25])
-    found = [found_planes(with_elevation_zero(points, float(offset))) for offset in offsets]
-    best = int(np.argmax([len(patches[0]) for patches in found]))
-    assert off_square_deg(found[best][:5]).max() < 0.6
 
 
 def test_two_walls_and_the_floor_before_a_vlp_16() -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from lidarpose.cli.options import Json, PositiveFloat, Quiet
+from lidarpose.cli.options import FiniteFloat, Json, PositiveFloat, Quiet
 from lidarpose.errors import InputError, RejectedError
 from lidarpose.model.sense import Sense, StatedSense
 
@@ -40,6 +40,8 @@ def calibrate(
     beams_turn: Annotated[Sense | None, Parameter(group="Turntable sessions")] = None,
     table_turns: Annotated[Sense | None, Parameter(group="Turntable sessions")] = None,
     estimate_scale: Annotated[bool, Parameter(negative=(), show_default=False, group="Corner sessions")] = False,
+    axis_beam_deg: Annotated[FiniteFloat | None, Parameter(group="Sweep recordings")] = None,
+    start: Annotated[Path | None, Parameter(group="Sweep recordings")] = None,
     want_mm: PositiveFloat | None = None,
     want_deg: PositiveFloat | None = None,
     report: Annotated[bool, Parameter(negative="--no-report", show_default=False)] = True,
@@ -48,12 +50,13 @@ def calibrate(
 ) -> None:
     """Find the LiDAR's pose from a session: DIR/calibration.json and DIR/report.html.
 
-    The kind of session, turntable or corner, is told by its session.toml.
+    The kind of session, turntable or corner, is told by its session.toml. A sweep recording of a room calibrates
+    its own rig without camera and target: sought is the mounting at which what is flat is flat (no report.html then).
 
     Parameters
     ----------
     session
-        The session's folder.
+        The session's folder, or that of a sweep recording.
     output
         The folder for the results; made if it is not there.
     method
@@ -75,6 +78,10 @@ def calibrate(
         The same for the turntable as its readings grow: negated readings show in no residual either.
     estimate_scale
         Estimate the scale between the LiDAR's metres and the world's.
+    axis_beam_deg
+        The beam angle that points along the turntable's axis, to some degrees, where the fan of beams holds the axis.
+    start
+        A calibration that is right to some degrees and centimetres: how any other rig is mounted.
     want_mm
         Standard deviation of the LiDAR's centre that is good enough, in mm.
     want_deg
@@ -83,9 +90,18 @@ def calibrate(
         Write report.html too.
     """
     from lidarpose.storage.atomic import prepare_folder
+    from lidarpose.storage.recording import is_recording
     from lidarpose.storage.session import CORNER_SESSION_FORMAT, SESSION_FORMAT, session_format
 
     prepare_folder(output)
+    if is_recording(session):
+        _calibrate_recording(
+            session, output, method, estimate, axis_beam_deg, start, want_mm, want_deg, json=json, quiet=quiet
+        )
+        return
+    if axis_beam_deg is not None or start is not None:
+        option = "--start" if axis_beam_deg is None else "--axis-beam-deg"
+        raise InputError(option, "is for sweep recordings", expected="a folder with recording.toml")
     found = session_format(session)
     if found == CORNER_SESSION_FORMAT:
         _calibrate_corners(
@@ -116,6 +132,36 @@ def calibrate(
     }
     run = _calibrate_turntable(session, options, quiet=quiet or json)
     _finish(run, session, output, with_report=report, json=json, quiet=quiet)
+
+
+def _calibrate_recording(
+    folder: Path,
+    output: Path,
+    method: str,
+    estimate: tuple[str, ...],
+    axis_beam_deg: float | None,
+    start: Path | None,
+    want_mm: float | None,
+    want_deg: float | None,
+    *,
+    json: bool,
+    quiet: bool,
+) -> None:
+    from lidarpose.cli.calibrate_recording import calibrate_recording
+
+    if method != "joint":
+        raise InputError("--method", f"{method!r} is for sessions", expected="nothing: a recording has one method")
+    calibrate_recording(
+        folder,
+        output,
+        axis_beam_deg=axis_beam_deg,
+        start=start,
+        estimate=estimate,
+        want_mm=want_mm,
+        want_deg=want_deg,
+        json=json,
+        quiet=quiet,
+    )
 
 
 def _calibrate_corners(

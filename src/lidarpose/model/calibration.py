@@ -10,6 +10,7 @@ import numpy as np
 
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose, UncertainPose, skew
+from lidarpose.model.beam_correction import BeamCorrection
 from lidarpose.model.turntable import PARAMETER_NAMES, TurntableMotion
 
 Verdict = Literal["good", "doubtful", "rejected"]
@@ -49,6 +50,8 @@ class TurntableCalibration:
         `lidarpose.model.turntable.PARAMETER_NAMES`. None where no uncertainty is known.
     quality, provenance
         Verdict and evidence; what is needed to repeat the run.
+    beams
+        What the LiDAR's own ranges and beam angles are off by, where that was estimated.
     """
 
     motion: TurntableMotion
@@ -56,6 +59,7 @@ class TurntableCalibration:
     parameter_names: tuple[str, ...] = PARAMETER_NAMES
     quality: Quality | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    beams: BeamCorrection = field(default_factory=BeamCorrection)
 
     @property
     def motion_covariance(self) -> FloatArray | None:

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose, UncertainPose
+from lidarpose.model.beam_correction import BeamCorrection
 from lidarpose.model.calibration import Quality, TurntableCalibration, uncertain_pose_at
 from lidarpose.model.observation import LeftOut
 from lidarpose.model.turntable import TurntableMotion
@@ -181,6 +182,7 @@ class TurntableEstimate:
 
     def calibration(self, provenance: Mapping[str, Any] | None = None) -> TurntableCalibration:
         """What goes into the calibration file."""
+        beams = BeamCorrection.from_extras(self.extra_values)
         return TurntableCalibration(
-            self.motion, self.parameter_covariance, self.parameter_names, self.quality, provenance or {}
+            self.motion, self.parameter_covariance, self.parameter_names, self.quality, provenance or {}, beams
         )

@@ -6,7 +6,7 @@ A reader needs `format`, `kind` and `transforms` alone, as files of other progra
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose
+from lidarpose.model.beam_correction import BeamCorrection
 from lidarpose.model.calibration import Calibration, Quality, TurntableCalibration, WorldCalibration
 from lidarpose.model.turntable import PARAMETER_NAMES, TurntableMotion
 from lidarpose.storage.atomic import write_text
@@ -52,6 +53,12 @@ class _ReadingsEntry(_Lenient):
     origin_rad: Annotated[float, Field(ge=-1e4, le=1e4)]
 
 
+class _BeamsEntry(_Lenient):
+    angle_scale: Annotated[float, Field(ge=0.5, le=2.0)] = 1.0
+    range_scale: Annotated[float, Field(ge=0.5, le=2.0)] = 1.0
+    range_offset_m: Annotated[float, Field(ge=-10.0, le=10.0)] = 0.0
+
+
 class _QualityEntry(_Lenient):
     model_config = ConfigDict(extra="allow", frozen=True)
     verdict: Literal["good", "doubtful", "rejected"]
@@ -64,6 +71,7 @@ class _CalibrationFile(_Lenient):
     transforms: Annotated[list[_TransformEntry], Field(min_length=1)]
     scale: Annotated[float, Field(gt=0.0)] = 1.0
     readings: _ReadingsEntry | None = None
+    beams: _BeamsEntry | None = None
     parameters: _ParametersEntry | None = None
     quality: _QualityEntry | None = None
     provenance: dict[str, Any] = {}
@@ -100,6 +108,8 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
     if isinstance(calibration, TurntableCalibration) and calibration.motion.reading_scale != 1.0:
         motion = calibration.motion
         document["readings"] = {"scale": motion.reading_scale, "origin_rad": motion.reading_origin_rad}
+    if isinstance(calibration, TurntableCalibration) and not calibration.beams.is_none:
+        document["beams"] = asdict(calibration.beams)
     if calibration.parameter_covariance is not None:
         document["parameters"] = {
             "names": list(calibration.parameter_names),
@@ -168,12 +178,13 @@ def _turntable(path: Path, file: _CalibrationFile, quality: Quality | None) -> T
     if file.readings is not None:
         # A turntable frame with another x reads the same angles: the origin is one of readings.
         motion = replace(motion, reading_scale=file.readings.scale, reading_origin_rad=file.readings.origin_rad)
+    beams = BeamCorrection() if file.beams is None else BeamCorrection(**file.beams.model_dump())
     names, covariance = _parameters(path, file)
     if covariance is None or names[: len(PARAMETER_NAMES)] != PARAMETER_NAMES:
         names, covariance = PARAMETER_NAMES, None
         if table_covariance is not None and lidar_covariance is not None:
             covariance = _motion_covariance(table, lidar, table_covariance, lidar_covariance)
-    return TurntableCalibration(motion, covariance, names, quality, file.provenance)
+    return TurntableCalibration(motion, covariance, names, quality, file.provenance, beams)
 
 
 def _motion_covariance(table: Pose, lidar: Pose, table_cov: FloatArray, lidar_cov: FloatArray) -> FloatArray:

@@ -45,6 +45,11 @@ def is_recording(path: Path) -> bool:
     return (Path(path) / HEAD).is_file()
 
 
+def recording_files(folder: Path) -> list[Path]:
+    """The files of a recording that are there."""
+    return [Path(folder) / name for name in sorted(_FILES) if (Path(folder) / name).is_file()]
+
+
 def read_recording(folder: Path) -> SweepRecording:
     """Open a recording; its large arrays are memory maps.
 

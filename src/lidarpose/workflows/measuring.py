@@ -19,6 +19,7 @@ from lidarpose.measure.cloud_beams import beams_of_cells, beams_of_rings, record
 from lidarpose.measure.disk import RoundMeasurement, measure_round, with_calibration
 from lidarpose.measure.outline import Kind, nothing_round
 from lidarpose.measure.planes import MeasuredPlane, joined_planes
+from lidarpose.model.beam_correction import BeamCorrection
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.recording import SweepRecording
@@ -93,8 +94,8 @@ def view_of_cloud(cloud: Cloud, calibration: TurntableCalibration | None) -> Mea
     if len(points) < 100:
         raise UndeterminedError("The cloud holds too few points to measure anything", remedy="Give a denser cloud.")
     if calibration is not None:
-        # A cloud tells where the table stood, not what it read.
-        calibration = replace(calibration, motion=calibration.motion.in_true_angles)
+        # A cloud tells where the table stood and what was met, not what was read.
+        calibration = replace(calibration, motion=calibration.motion.in_true_angles, beams=BeamCorrection())
         recording = recording_from_cloud(points, calibration.motion, light)
         if recording is not None:
             view = view_of_recording(recording, calibration)

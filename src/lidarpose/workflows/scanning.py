@@ -117,7 +117,8 @@ def assemble_scan(
 
 
 def in_true_angles(recording: SweepRecording, calibration: TurntableCalibration) -> SweepRecording:
-    """The recording with the table's angles in place of readings that are off by the calibration's factor."""
+    """The recording with true angles and ranges in place of those that the calibration says are off."""
+    recording = calibration.beams.apply(recording)
     if calibration.motion.reading_scale == 1.0:
         return recording
     readings = np.deg2rad(np.asarray(recording.turntable_angle_deg, dtype=np.float64))

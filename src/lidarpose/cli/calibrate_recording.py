@@ -1,0 +1,173 @@
+"""The recording branch of `lidarpose calibrate`: a spun 2D LiDAR calibrated from the flat surfaces it sees."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lidarpose.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from lidarpose.geometry.se3 import Pose
+    from lidarpose.model.spun_scan import MountingRun
+
+# As in `lidarpose.refine.flatness.EXTRA_NAMES`; what else `--estimate` knows needs a target.
+_EXTRAS = {
+    "encoder-scale": "encoder_scale",
+    "range-offset": "range_offset_m",
+    "beam-angle-scale": "beam_angle_scale",
+}
+
+
+def calibrate_recording(
+    folder: Path,
+    output: Path,
+    *,
+    axis_beam_deg: float | None,
+    start: Path | None,
+    estimate: tuple[str, ...] = (),
+    want_mm: float | None = None,
+    want_deg: float | None = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> MountingRun:
+    """Calibrate from a sweep recording and write `output`/calibration.json.
+
+    Parameters
+    ----------
+    axis_beam_deg, start
+        One of the two: the beam angle that points along the turntable's axis, or a calibration file that is roughly
+        right.
+    estimate
+        Extra parameters by their names on the command line.
+
+    Raises
+    ------
+    InputError
+        For unreadable input, or without a start.
+    UndeterminedError
+        If the scene does not tell the mounting.
+    """
+    from lidarpose.cli.console import out, print_json, progress
+    from lidarpose.refine.mounting import MountingOptions
+    from lidarpose.storage.calibration import write_calibration
+    from lidarpose.storage.provenance import provenance
+    from lidarpose.storage.recording import read_recording, recording_files
+    from lidarpose.workflows.self_calibration import MOST_ROUNDS, calibrate_by_flatness
+
+    T_table_lidar = _start(axis_beam_deg, start)
+    wishes = {k: v for k, v in (("want_mm", want_mm), ("want_deg", want_deg)) if v is not None}
+    options = MountingOptions(tuple(_parameter(name) for name in estimate), **wishes)
+    recording = read_recording(folder)
+    stated = {
+        "axis_beam_deg": axis_beam_deg,
+        "start": None if start is None else start.name,
+        "estimate": list(estimate),
+        **wishes,
+    }
+    with progress("rounds", MOST_ROUNDS, quiet=quiet or json) as advance:
+        run = calibrate_by_flatness(
+            recording,
+            T_table_lidar,
+            options,
+            provenance=provenance("calibrate", folder, recording_files(folder), stated),
+            step=advance,
+        )
+    written = output / "calibration.json"
+    write_calibration(written, run.calibration)
+    if json:
+        print_json(summary(run))
+    else:
+        _print(out(), run, written)
+    return run
+
+
+def _parameter(name: str) -> str:
+    if name not in _EXTRAS:
+        raise InputError(
+            f"--estimate {name}",
+            "cannot be told from flat surfaces of unknown size and place",
+            expected="for a sweep recording: " + ", ".join(_EXTRAS),
+        )
+    return _EXTRAS[name]
+
+
+def _start(axis_beam_deg: float | None, start: Path | None) -> Pose:
+    import math
+
+    from lidarpose.storage.calibration import read_turntable_calibration
+    from lidarpose.workflows.self_calibration import axis_in_fan
+
+    if (axis_beam_deg is None) == (start is None):
+        raise InputError(
+            "--axis-beam-deg",
+            "is missing" if start is None else "and --start are both given",
+            expected="how the LiDAR is mounted, roughly, in one of two ways",
+            remedy="Give the beam angle that points along the turntable's axis (--axis-beam-deg 90), or a calibration "
+            "file of about that rig (--start FILE)",
+        )
+    if start is not None:
+        return read_turntable_calibration(start).motion.T_turntable_lidar
+    assert axis_beam_deg is not None
+    return axis_in_fan(math.radians(axis_beam_deg))
+
+
+def summary(run: MountingRun) -> dict[str, Any]:
+    """The result as a JSON object; units in the keys."""
+    estimate, quality = run.estimate, run.estimate.quality
+    return {
+        "kind": "turntable",
+        "verdict": quality.verdict,
+        "reasons": list(quality.reasons),
+        **quality.figures,
+        "radius_mm": 1e3 * run.calibration.motion.radius_m,
+        "axis_in_lidar": estimate.T_table_lidar.rotation[2].tolist(),
+        "extras": [
+            {
+                "name": extra.name,
+                "value": extra.value,
+                "sigma": extra.sigma,
+                "estimated": extra.estimated,
+                "suggested": extra.suggested,
+            }
+            for extra in estimate.extras
+        ],
+        "planes": [
+            {
+                "normal": surface.plane.normal.tolist(),
+                "offset_m": surface.plane.offset,
+                "returns": surface.returns,
+                "range_sigma_mm": 1e3 * surface.sigma_m,
+                "pull": surface.pull,
+            }
+            for surface in estimate.surfaces
+        ],
+        "rounds": run.rounds,
+    }
+
+
+def _print(console: Console, run: MountingRun, written: Path) -> None:
+    from lidarpose.report.page import Verdict
+    from lidarpose.report.summary import figures_table, print_verdict
+
+    estimate, quality = run.estimate, run.estimate.quality
+    figures = quality.figures
+    say = (
+        f"{figures['surfaces']} flat surfaces with {figures['returns']} returns; tilt known to "
+        f"{figures['sigma_tilt_deg']:.3g} deg, place to {figures['sigma_shift_mm']:.3g} mm"
+    )
+    print_verdict(console, Verdict(quality.verdict, "Mounting from flatness", say, quality.reasons))
+    x, y, z = estimate.T_table_lidar.rotation[2]
+    radius_mm = 1e3 * run.calibration.motion.radius_m
+    console.print(
+        f"axis in the LiDAR's frame ({x:+.5f}, {y:+.5f}, {z:+.5f}); radius {radius_mm:.2f} mm", soft_wrap=True
+    )
+    rows = []
+    for extra in estimate.extras:
+        factor, unit = (1e3, "mm") if extra.name.endswith("_m") else (1e2, "%")
+        state = "estimated" if extra.estimated else ("missing" if extra.suggested else "left alone")
+        rows.append((extra.name, f"{factor * extra.value:.3f} {unit}", f"{factor * extra.sigma:.3f} {unit}", state))
+    console.print(figures_table("Further parameters", ("value", "standard deviation", ""), rows))
+    console.print(f"written: {written}", markup=False, soft_wrap=True)

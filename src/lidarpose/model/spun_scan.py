@@ -1,0 +1,117 @@
+"""A spun 2D LiDAR calibrated from what it sees: returns on flat surfaces, and the estimate they give."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.geometry.planes import Plane
+from lidarpose.geometry.se3 import Pose
+from lidarpose.model.calibration import Quality, TurntableCalibration
+from lidarpose.model.turntable_result import ExtraParameter
+
+
+@dataclass(frozen=True, eq=False)
+class FlatReturns:
+    """Returns on flat surfaces, as the instrument gave them; surfaces are numbered from 0, none is missing.
+
+    Attributes
+    ----------
+    reading_rad, beam_rad, range_m : (n,)
+        The turntable's reading, the beam's angle, the range.
+    sweep, surface : (n,)
+        Which sweep a return is of, and which surface it lies on.
+    """
+
+    reading_rad: FloatArray
+    beam_rad: FloatArray
+    range_m: FloatArray
+    sweep: IntArray
+    surface: IntArray
+
+    def __len__(self) -> int:
+        return len(self.range_m)
+
+    @property
+    def surfaces(self) -> int:
+        """How many."""
+        return int(self.surface.max()) + 1 if len(self) else 0
+
+
+@dataclass(frozen=True, eq=False)
+class FlatSurface:
+    """A surface of the estimate.
+
+    Attributes
+    ----------
+    plane
+        In the table's frame.
+    returns, used
+        On it, and of these with more than half of the full weight.
+    sigma_m
+        Robust spread of the ranges along the beam.
+    pull
+        By how many standard deviations (root mean square) it disagrees with the others about what is estimated.
+    """
+
+    plane: Plane
+    returns: int
+    used: int
+    sigma_m: float
+    pull: float
+
+
+@dataclass(frozen=True, eq=False)
+class MountingEstimate:
+    """How a LiDAR sits on its turntable, from the flatness of what it sees.
+
+    Attributes
+    ----------
+    T_table_lidar
+        In the table's frame: z along the axis, the foot of the LiDAR's centre at height 0. The turn about z is as in
+        the start: nothing in the scene tells it.
+    reading_origin_rad
+        The reading about which a factor on readings is counted.
+    extras
+        Further parameters, estimated or tested.
+    parameter_names, covariance
+        "rx_rad", "ry_rad" (left rotation of T_table_lidar, its translation held), "x_m", "y_m" (its translation), then
+        the extra parameters that were estimated.
+    surfaces
+        Those that were used.
+    bending_m
+        What parts of the surfaces are off by beyond their noise: root mean square over all parts.
+    reading_scatter_rad
+        What single sweeps' readings seem to be off by beyond their noise: root mean square.
+    spread_factor
+        By how much more the surfaces disagree with each other than their patches say; the covariance is widened by it
+        where it is above 1.
+    """
+
+    T_table_lidar: Pose
+    reading_origin_rad: float
+    extras: tuple[ExtraParameter, ...]
+    parameter_names: tuple[str, ...]
+    covariance: FloatArray
+    surfaces: tuple[FlatSurface, ...]
+    bending_m: float
+    reading_scatter_rad: float
+    spread_factor: float
+    converged: bool
+    quality: Quality
+
+    @property
+    def extra_values(self) -> Mapping[str, float]:
+        """Of the extra parameters that were estimated."""
+        return {e.name: e.value for e in self.extras if e.estimated}
+
+
+@dataclass(frozen=True, eq=False)
+class MountingRun:
+    """A whole self-calibration: the file's content and the evidence."""
+
+    calibration: TurntableCalibration
+    estimate: MountingEstimate
+    returns: int
+    rounds: int

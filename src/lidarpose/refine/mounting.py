@@ -1,0 +1,299 @@
+"""The estimate of a spun 2D LiDAR's mounting with its tests: what the scene tells, and what to think of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarpose.errors import UndeterminedError
+from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.geometry.se3 import Pose, skew
+from lidarpose.model.beam_correction import BeamCorrection
+from lidarpose.model.calibration import Quality, TurntableCalibration
+from lidarpose.model.spun_scan import FlatReturns, FlatSurface, MountingEstimate
+from lidarpose.model.turntable import PARAMETER_NAMES
+from lidarpose.model.turntable_result import ExtraParameter
+from lidarpose.refine.flatness import (
+    EXTRA_NAMES,
+    MOUNTING_NAMES,
+    N_MOUNTING,
+    Evidence,
+    Solution,
+    bending,
+    evidence_of,
+    reading_scatter,
+    solve,
+    start_state,
+)
+from lidarpose.refine.turntable_state import regular_motion
+
+# A mounting less certain than this is not known; the estimate may then be anywhere.
+LARGEST_TILT_SIGMA_RAD = np.radians(2.0)
+LARGEST_SHIFT_SIGMA_M = 0.1
+# An extra parameter less certain than this is not told by the scene.
+LARGEST_EXTRA_SIGMA = {"encoder_scale": 0.02, "range_offset_m": 0.03, "beam_angle_scale": 0.02}
+# A parameter is missing where it would come to this many standard deviations and take away this share of the squares:
+# less is no main cause of a misfit.
+SUGGESTED_SIGMAS = 6.0
+SUGGESTED_SHARE = 0.1
+# Surfaces that disagree by this much more than their patches do are not all flat, or not all still.
+LARGEST_SPREAD_FACTOR = 3.0
+LARGEST_BENDING_SHARE = 0.6
+LARGEST_READING_SCATTER_RAD = np.radians(0.25)
+LEAST_SURFACES = 3
+IN_WORDS = {
+    "encoder_scale": ("the turntable's readings are off by a factor", "encoder-scale"),
+    "range_offset_m": ("the ranges are off by a constant", "range-offset"),
+    "beam_angle_scale": ("the beam angles are off by a factor", "beam-angle-scale"),
+}
+
+
+@dataclass(frozen=True)
+class MountingOptions:
+    """What to estimate beside the mounting, and what is good enough.
+
+    Attributes
+    ----------
+    estimate
+        Of `lidarpose.refine.flatness.EXTRA_NAMES`.
+    want_mm, want_deg
+        Standard deviation of the LiDAR's place and tilt that still counts as good.
+    """
+
+    estimate: tuple[str, ...] = ()
+    want_mm: float = 20.0
+    want_deg: float = 0.3
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.estimate if name not in EXTRA_NAMES]
+        if unknown:
+            raise ValueError(f"no such parameter: {', '.join(unknown)}; known are {', '.join(EXTRA_NAMES)}")
+
+    @property
+    def free(self) -> IntArray:
+        """Indices of what is estimated."""
+        extras = [N_MOUNTING + EXTRA_NAMES.index(name) for name in EXTRA_NAMES if name in self.estimate]
+        return np.array([*range(N_MOUNTING), *extras], dtype=np.int64)
+
+
+def refine_mounting(
+    returns: FlatReturns,
+    T_table_lidar: Pose,
+    options: MountingOptions | None = None,
+    *,
+    extras: FloatArray | None = None,
+    origin_rad: float | None = None,
+) -> MountingEstimate:
+    """The mounting at which the surfaces are flattest, with its covariance and a verdict.
+
+    Parameters
+    ----------
+    returns
+        On at least three surfaces.
+    T_table_lidar
+        A start, some degrees and centimetres off at most. Its turn about z stays.
+    extras : (3,)
+        A start of the extra parameters; zeros by default.
+    origin_rad
+        The reading that a factor on readings is counted from; the middle of the readings by default.
+
+    Raises
+    ------
+    UndeterminedError
+        If the surfaces do not tell the mounting.
+    """
+    options = options or MountingOptions()
+    if returns.surfaces < LEAST_SURFACES:
+        raise _undetermined(f"{returns.surfaces} flat surfaces were found, and a mounting needs at least three")
+    if origin_rad is None:
+        origin_rad = 0.5 * float(returns.reading_rad.min() + returns.reading_rad.max())
+    start = Pose(T_table_lidar.rotation, T_table_lidar.translation * [1.0, 1.0, 0.0])
+    free = options.free
+    try:
+        state = start_state(returns, start, np.zeros(3) if extras is None else extras, origin_rad)
+        solution = solve(returns, state, free, origin_rad)
+        evidence = evidence_of(solution, returns, free)
+        covariance = evidence.covariance(free)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise _undetermined("The flat surfaces seen leave the mounting open") from error
+    _refuse_undetermined(covariance, options.estimate)
+    tested = _extras(solution, evidence, options.estimate, covariance)
+    bent = bending(solution, returns)
+    scatter = reading_scatter(solution, returns)
+    surfaces = _surfaces(solution, evidence, returns)
+    quality = _quality(solution, evidence, tested, covariance, bent, scatter, surfaces, options)
+    return MountingEstimate(
+        solution.state.T_table_lidar,
+        origin_rad,
+        tested,
+        (*MOUNTING_NAMES, *(EXTRA_NAMES[i - N_MOUNTING] for i in free[N_MOUNTING:])),
+        covariance,
+        surfaces,
+        bent,
+        scatter,
+        evidence.spread_factor,
+        solution.converged,
+        quality,
+    )
+
+
+def _undetermined(what: str) -> UndeterminedError:
+    return UndeterminedError(
+        what,
+        remedy="Record a room with floor or ceiling and two walls that are no continuation of each other, over as much "
+        "of the turn as the rig allows.",
+    )
+
+
+def _refuse_undetermined(covariance: FloatArray, estimate: Sequence[str]) -> None:
+    sigma = np.sqrt(np.diag(covariance))
+    if not np.all(np.isfinite(sigma)):
+        raise _undetermined("The flat surfaces seen leave the mounting open")
+    for name, value in zip((n for n in EXTRA_NAMES if n in estimate), sigma[N_MOUNTING:], strict=True):
+        if value > LARGEST_EXTRA_SIGMA[name]:
+            unit, factor = ("mm", 1e3) if name.endswith("_m") else ("%", 1e2)
+            raise UndeterminedError(
+                f"{name} is not told by this scene: its standard deviation would be {factor * value:.2g} {unit}",
+                remedy=f"Leave out --estimate {IN_WORDS[name][1]}, or record surfaces that are nearer and farther, "
+                "and more of the turn.",
+            )
+    tilt, shift = float(sigma[:2].max()), float(sigma[2:4].max())
+    if tilt > LARGEST_TILT_SIGMA_RAD or shift > LARGEST_SHIFT_SIGMA_M:
+        raise _undetermined(
+            f"The flat surfaces seen leave the mounting open: standard deviations {np.degrees(tilt):.2g} deg "
+            f"and {1e3 * shift:.3g} mm"
+        )
+
+
+def _extras(
+    solution: Solution, evidence: Evidence, estimate: Sequence[str], covariance: FloatArray
+) -> tuple[ExtraParameter, ...]:
+    """Those that were estimated, and one linear step for each of the others."""
+    free = [*range(N_MOUNTING), *(N_MOUNTING + k for k, n in enumerate(EXTRA_NAMES) if n in estimate)]
+    squares = float((solution.weight * solution.line.residual**2).sum())
+    out, gains = [], {}
+    for k, name in enumerate(EXTRA_NAMES):
+        index = N_MOUNTING + k
+        if name in estimate:
+            at = free.index(index)
+            sigma = float(np.sqrt(covariance[at, at]))
+            out.append(ExtraParameter(name, float(solution.state.extras[k]), sigma, estimated=True, observable=True))
+            continue
+        value, sigma, gain = _one_step(evidence, np.array(free), index)
+        observable = sigma < LARGEST_EXTRA_SIGMA[name]
+        if observable and abs(value) > SUGGESTED_SIGMAS * sigma and gain > SUGGESTED_SHARE * squares:
+            gains[name] = gain
+        out.append(ExtraParameter(name, value, sigma, estimated=False, observable=observable))
+    if not gains:
+        return tuple(out)
+    best = max(gains, key=lambda name: gains[name])
+    return tuple(ExtraParameter(e.name, e.value, e.sigma, e.estimated, e.observable, e.name == best) for e in out)
+
+
+def _one_step(evidence: Evidence, free: IntArray, index: int) -> tuple[float, float, float]:
+    """Value and standard deviation of a further parameter, and by what the weighted squares would fall."""
+    A = evidence.information
+    along = np.linalg.solve(A[np.ix_(free, free)], A[free, index])
+    left = float(A[index, index] - A[index, free] @ along)
+    if not left > 1e-9 * float(A[index, index]):
+        return 0.0, float("inf"), 0.0
+    value = float(evidence.gradient[index] - along @ evidence.gradient[free]) / left
+    # What the surfaces disagree by may be what this parameter mends: it is not counted against it.
+    sigma = float(np.sqrt(evidence.covariance(np.append(free, index), widened=False)[-1, -1]))
+    return value, sigma, value**2 * left
+
+
+def _surfaces(solution: Solution, evidence: Evidence, returns: FlatReturns) -> tuple[FlatSurface, ...]:
+    full = 1.0 / solution.sigma[returns.surface] ** 2
+    out = []
+    for k, plane in enumerate(solution.state.planes):
+        mine = returns.surface == k
+        used = int(np.count_nonzero(solution.weight[mine] > 0.5 * full[mine]))
+        out.append(FlatSurface(plane, int(mine.sum()), used, float(solution.sigma[k]), float(evidence.pulls[k])))
+    return tuple(out)
+
+
+def _quality(
+    solution: Solution,
+    evidence: Evidence,
+    extras: Sequence[ExtraParameter],
+    covariance: FloatArray,
+    bent: float,
+    scatter: float,
+    surfaces: Sequence[FlatSurface],
+    options: MountingOptions,
+) -> Quality:
+    sigma = np.sqrt(np.diag(covariance))
+    tilt_deg, shift_mm = float(np.degrees(sigma[:2].max())), float(1e3 * sigma[2:4].max())
+    typical = float(np.median(np.repeat(solution.sigma, [s.returns for s in surfaces])))
+    reasons = [_suggestion(extra) for extra in extras if extra.suggested]
+    if not solution.converged:
+        reasons.append("the estimate did not settle: the start may be too far off, or the scene not flat enough")
+    if scatter > LARGEST_READING_SCATTER_RAD:
+        reasons.append(
+            f"single sweeps' readings seem to be off by {np.degrees(scatter):.2f} deg or more: a table that slips, "
+            "sticks or reports where it was told to go; no mounting mends that"
+        )
+    if evidence.spread_factor > LARGEST_SPREAD_FACTOR:
+        worst = max(range(len(surfaces)), key=lambda k: surfaces[k].pull)
+        reasons.append(
+            f"the surfaces contradict each other about the mounting by {evidence.spread_factor:.1f} times their noise, "
+            f"most of all the one with {surfaces[worst].returns} returns"
+        )
+    if bent > LARGEST_BENDING_SHARE * typical:
+        reasons.append(f"the surfaces are bent by {1e3 * bent:.1f} mm beyond their noise of {1e3 * typical:.1f} mm")
+    if tilt_deg > options.want_deg or shift_mm > options.want_mm:
+        reasons.append(
+            f"standard deviations of {tilt_deg:.2g} deg and {shift_mm:.3g} mm; wanted are {options.want_deg:g} deg "
+            f"and {options.want_mm:g} mm: record more of the turn, or surfaces on more sides"
+        )
+    figures = {
+        "method": "flatness",
+        "surfaces": len(surfaces),
+        "returns": int(sum(s.returns for s in surfaces)),
+        "sigma_tilt_deg": tilt_deg,
+        "sigma_shift_mm": shift_mm,
+        "range_noise_mm": 1e3 * typical,
+        "bending_mm": 1e3 * bent,
+        "reading_scatter_deg": float(np.degrees(scatter)),
+        "spread_factor": evidence.spread_factor,
+    }
+    return Quality("doubtful" if reasons else "good", tuple(reasons), figures)
+
+
+def _suggestion(extra: ExtraParameter) -> str:
+    words, option = IN_WORDS[extra.name]
+    if extra.name.endswith("_m"):
+        size = f"{1e3 * extra.value:.1f} mm (standard deviation {1e3 * extra.sigma:.1f})"
+    else:
+        size = f"{1e2 * extra.value:.2f} % (standard deviation {1e2 * extra.sigma:.2f})"
+    return f"{words}, it seems, by about {size}: try --estimate {option}"
+
+
+def mounting_calibration(estimate: MountingEstimate) -> TurntableCalibration:
+    """The calibration file's content. There is no camera: its frame stands for the table's, as the start has it."""
+    T = estimate.T_table_lidar
+    motion = regular_motion(Pose.identity(), T)
+    # By the ten numbers from the four: both describe the same poses, so it follows from the poses at three readings.
+    readings = np.array([-2.1, 0.0, 2.1])
+    four = np.zeros((6, 4))
+    four[:3, :2], four[3:, :2] = skew(T.translation)[:, :2], np.eye(3)[:, :2]
+    four[:3, 2:] = np.eye(3)[:, :2]
+    inside = np.concatenate([Pose.rot_z(float(a)).adjoint() @ four for a in readings])
+    outside = np.concatenate([motion.pose_jacobian(float(a)) for a in readings])
+    extras = len(estimate.parameter_names) - N_MOUNTING
+    J = np.zeros((len(PARAMETER_NAMES) + extras, N_MOUNTING + extras))
+    J[:10, :4] = np.linalg.lstsq(outside, inside, rcond=None)[0]
+    J[10:, 4:] = np.eye(extras)
+    values = dict(estimate.extra_values)
+    if "encoder_scale" in values:
+        motion = replace(
+            motion, reading_scale=1.0 + values["encoder_scale"], reading_origin_rad=estimate.reading_origin_rad
+        )
+    names = (*PARAMETER_NAMES, *estimate.parameter_names[N_MOUNTING:])
+    covariance = J @ estimate.covariance @ J.T
+    return TurntableCalibration(
+        motion, 0.5 * (covariance + covariance.T), names, estimate.quality, beams=BeamCorrection.from_extras(values)
+    )

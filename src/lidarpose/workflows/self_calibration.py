@@ -1,0 +1,157 @@
+"""A sweep recording calibrates its own rig: flat surfaces are looked for, the mounting is refined on them, and again.
+
+Surfaces that a wrong mounting bends are found in pieces at first; as the mounting gets better the pieces grow together
+and tell more.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
+from lidarpose.errors import UndeterminedError
+from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.geometry.se3 import Pose
+from lidarpose.model.plane_patch import PlanePatch
+from lidarpose.model.recording import SweepRecording
+from lidarpose.model.spun_scan import FlatReturns, MountingEstimate, MountingRun
+from lidarpose.refine.flatness import EXTRA_NAMES, points_in_table
+from lidarpose.refine.mounting import MountingOptions, mounting_calibration, refine_mounting
+
+# Enough for a tenth of a millimetre on a wall; a search for planes in more takes its time.
+MOST_RETURNS = 120_000
+MOST_ROUNDS = 10
+MOST_SURFACES = 30
+# Pieces of less than this share of all returns tell little and may be clutter.
+LEAST_SHARE = 0.004
+LEAST_RETURNS = 150
+# Pieces that spread this much wider than the typical return's surface are no surfaces.
+WIDEST_SPREAD = 2.5
+# Settled is what moves by less than this share of its standard deviation.
+SETTLED = 0.5
+
+
+def axis_in_fan(axis_beam_rad: float) -> Pose:
+    """T_table_lidar of a LiDAR on the axis, whose fan holds the axis: the beam of this angle points along it."""
+    c, s = np.cos(axis_beam_rad), np.sin(axis_beam_rad)
+    z = np.array([c, s, 0.0])
+    # The beam a right angle behind the axis' one points along the table's x.
+    x = np.array([s, -c, 0.0])
+    return Pose(np.stack([x, np.cross(z, x), z]), np.zeros(3))
+
+
+def calibrate_by_flatness(
+    recording: SweepRecording,
+    T_table_lidar: Pose,
+    options: MountingOptions | None = None,
+    *,
+    provenance: Mapping[str, Any] | None = None,
+    step: Callable[[], None] | None = None,
+) -> MountingRun:
+    """Where a LiDAR sits on its turntable, from a recording of a room.
+
+    Parameters
+    ----------
+    recording
+        Sweeps of flat surfaces on several sides; the more of the turn the better.
+    T_table_lidar
+        Roughly how the LiDAR is mounted (`axis_in_fan`, or from drawings): some degrees and centimetres.
+    step
+        Called after each round.
+
+    Raises
+    ------
+    UndeterminedError
+        If too few surfaces are found, or they do not tell the mounting.
+    """
+    options = options or MountingOptions()
+    returns = _all_returns(recording)
+    origin_rad = 0.5 * float(returns.reading_rad.min() + returns.reading_rad.max())
+    pose, extras = T_table_lidar, np.zeros(len(EXTRA_NAMES))
+    before: FloatArray | None = None
+    rounds = 0
+    while True:
+        rounds += 1
+        flat = _flat_returns(returns, pose, extras, origin_rad)
+        estimate = refine_mounting(flat, pose, options, extras=extras, origin_rad=origin_rad)
+        pose = estimate.T_table_lidar
+        extras = np.array([estimate.extra_values.get(name, 0.0) for name in EXTRA_NAMES])
+        if step is not None:
+            step()
+        now = _as_numbers(estimate)
+        if before is not None and _moved(now - before, estimate, T_table_lidar) < SETTLED:
+            break
+        if rounds == MOST_ROUNDS:
+            estimate = _unsettled(estimate)
+            break
+        before = now
+    calibration = dataclasses.replace(mounting_calibration(estimate), provenance=dict(provenance or {}))
+    return MountingRun(calibration, estimate, len(returns), rounds)
+
+
+def _all_returns(recording: SweepRecording) -> FlatReturns:
+    """Every return, or those of evenly chosen sweeps where there are many; all on surface 0."""
+    returned = recording.has_return()
+    total = int(np.count_nonzero(returned))
+    if total < LEAST_RETURNS:
+        raise UndeterminedError(f"The recording holds {total} returns", remedy="Record a room.")
+    every = max(1, round(total / MOST_RETURNS))
+    chosen = np.zeros(recording.sweeps, dtype=bool)
+    chosen[::every] = True
+    sweep, beam = np.nonzero(returned & chosen[:, None])
+    reading = recording.turntable_angle_rad
+    if recording.has_reading_per_beam:
+        of_return = reading[sweep, beam]
+    else:
+        of_return = reading[sweep]
+    ranges = np.asarray(recording.range_m)[sweep, beam].astype(np.float64)
+    return FlatReturns(of_return, recording.beam_angle_rad[beam], ranges, sweep, np.zeros(len(sweep), dtype=np.int64))
+
+
+def _flat_returns(returns: FlatReturns, pose: Pose, extras: FloatArray, origin_rad: float) -> FlatReturns:
+    points = points_in_table(pose, extras, origin_rad, returns.reading_rad, returns.beam_rad, returns.range_m)
+    least = max(LEAST_RETURNS, int(LEAST_SHARE * len(points)))
+    found = segment_planes(points, PlaneSearch(max_planes=60, min_points=least, from_sensor=True))
+    patches = _surfaces_among(found)
+    index: IntArray = np.concatenate([p.indices for p in patches]) if patches else np.zeros(0, dtype=np.int64)
+    surface = np.repeat(np.arange(len(patches)), [len(p) for p in patches])
+    return FlatReturns(
+        returns.reading_rad[index], returns.beam_rad[index], returns.range_m[index], returns.sweep[index], surface
+    )
+
+
+def _surfaces_among(patches: tuple[PlanePatch, ...]) -> list[PlanePatch]:
+    """The largest patches, those left out that spread much wider than the typical return's patch does."""
+    if not patches:
+        return []
+    sigma = np.array([p.sigma_m for p in patches])
+    typical = float(np.median(np.repeat(sigma, [len(p) for p in patches])))
+    kept = [p for p in patches if p.sigma_m <= WIDEST_SPREAD * typical]
+    return sorted(kept, key=len, reverse=True)[:MOST_SURFACES]
+
+
+def _as_numbers(estimate: MountingEstimate) -> FloatArray:
+    values = [estimate.extra_values[name] for name in estimate.parameter_names[4:]]
+    return np.concatenate([estimate.T_table_lidar.rotation.ravel(), estimate.T_table_lidar.translation[:2], values])
+
+
+def _moved(change: FloatArray, estimate: MountingEstimate, start: Pose) -> float:
+    """The largest change of tilt, shift and extra parameters over its standard deviation."""
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    tilt = np.linalg.norm(change[:9]) / np.sqrt(2.0) / max(float(sigma[:2].max()), 1e-12)
+    rest = np.abs(change[9:]) / np.maximum(np.concatenate([[sigma[2:4].max()] * 2, sigma[4:]]), 1e-12)
+    return float(max(tilt, rest.max()))
+
+
+def _unsettled(estimate: MountingEstimate) -> MountingEstimate:
+    quality = estimate.quality
+    reason = "surfaces and mounting did not settle on each other: what is found flat changes with the mounting"
+    return dataclasses.replace(
+        estimate,
+        converged=False,
+        quality=dataclasses.replace(quality, verdict="doubtful", reasons=(*quality.reasons, reason)),
+    )
