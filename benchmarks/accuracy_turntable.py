@@ -50,7 +50,7 @@ SETTINGS = (
     Setting("87 places, ranges 1 mm"),
     Setting("87 places, ranges 3 mm", range_sigma_m=0.003),
     Setting("5 places, ranges 1 mm", places=5),
-    Setting("10 % outliers in stripes and ranges", blunders=Blunders(stripe_share=0.1, range_share=0.1), share=0.3),
+    Setting("10 % outliers in stripes and ranges", blunders=Blunders(stripe_share=0.1, range_share=0.1)),
     Setting("black 1 mm long, option off", blunders=Blunders(black_range_bias_m=1e-3), share=0.3),
     Setting(
         "black 1 mm long, option on", blunders=Blunders(black_range_bias_m=1e-3), estimate=("black_bias_m",), share=0.3

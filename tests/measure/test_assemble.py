@@ -8,9 +8,11 @@ import pytest
 from lidarpose.geometry.se3 import Pose
 from lidarpose.measure.assemble import assemble, beam_origins_and_directions, has_compiler, readings_between
 from lidarpose.measure.point_sigma import moved_variance, point_sigma
+from lidarpose.model.beam_correction import BeamCorrection
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.recording import SweepRecording
-from lidarpose.model.turntable import TurntableMotion
+from lidarpose.model.turntable import PARAMETER_NAMES, TurntableMotion
+from lidarpose.workflows.scanning import in_true_angles
 
 
 def some_motion(rng: np.random.Generator) -> TurntableMotion:
@@ -104,3 +106,32 @@ def test_point_sigma_joins_calibration_and_range_noise() -> None:
     expected = np.sqrt(np.var(samples, axis=0).sum())
     assert sigma[i, j] == pytest.approx(expected, rel=0.05)
     assert np.isnan(sigma[0, 0])
+
+
+def test_point_sigma_holds_further_parameters() -> None:
+    """Against points drawn with the motion and four further parameters all at once, correlated."""
+    rng = np.random.default_rng(8)
+    motion, recording = some_motion(rng), some_recording(rng, per_beam=False)
+    motion = replace(motion, reading_scale=1.03, reading_origin_rad=0.4)
+    beams = BeamCorrection(angle_scale=0.98, range_scale=1.01, range_offset_m=0.02)
+    names = (*PARAMETER_NAMES, "encoder_scale", "range_offset_m", "range_scale", "beam_angle_scale")
+    root = rng.normal(size=(14, 14)) * 3e-4
+    calibration = TurntableCalibration(motion, root @ root.T, names, beams=beams)
+    true = in_true_angles(recording, calibration)
+    sigma = point_sigma(assemble(true, motion.in_true_angles), true, calibration, None)
+    i, j = 4, 6
+    samples = []
+    for _ in range(4000):
+        step = root @ rng.normal(size=14)
+        turned = Pose.exp(np.r_[np.zeros(3), step[7:10]]).rotation @ motion.T_turntable_lidar.rotation
+        moved = TurntableMotion(
+            Pose.exp(step[:6]) @ motion.T_camera_turntable,
+            Pose(turned, [motion.radius_m + step[6], 0.0, 0.0]),
+            motion.reading_scale + step[10],
+            motion.reading_origin_rad,
+        )
+        off = BeamCorrection(0.98 + step[13], 1.01 + step[12], 0.02 + step[11])
+        again = in_true_angles(recording.part(i, i + 1), TurntableCalibration(moved, beams=off))
+        samples.append(assemble(again, moved.in_true_angles, dtype=np.float64)[0, j])
+    expected = np.sqrt(np.var(samples, axis=0).sum())
+    assert sigma[i, j] == pytest.approx(expected, rel=0.05)

@@ -20,6 +20,7 @@ from lidarpose.model.turntable_result import ResidualGroup
 from lidarpose.model.turntable_run import Deviation, TruthError, TurntableRun
 from lidarpose.report.turn_numbers import turn_numbers
 from lidarpose.report.turntable_page import turntable_page
+from lidarpose.report.turntable_scene import turntable_scene
 from tests_support.browser import Browser
 from tests_support.page_checks import assert_sound, scene_ink, scene_middle
 from tests_support.turntable_runs import turntable_run
@@ -176,6 +177,19 @@ def test_point_uncertainty_against_sampling(good_run: TurntableRun) -> None:
         moved.append(Pose.exp(step[:6]) @ motion.T_camera_turntable @ turn @ (mounting @ points))
     spread = 1e3 * np.sqrt(np.var(np.stack(moved), axis=0).sum(axis=1))
     assert numbers.point_mm[3.0][k] == pytest.approx(spread.max(), rel=0.06)
+
+
+def test_the_scene_turns_by_where_the_table_stands(good_run: TurntableRun) -> None:
+    """Of readings that are off by a factor the slider shows readings; the arc is where the LiDAR's centre was."""
+    motion = replace(good_run.calibration.motion, reading_scale=1.5, reading_origin_rad=0.2)
+    run = replace(good_run, calibration=replace(good_run.calibration, motion=motion))
+    scene = turntable_scene(run)
+    assert scene["motion"]["scale"] == 1.5
+    assert scene["motion"]["origin"] == pytest.approx(np.degrees(0.2))
+    ends = [motion.pose(run.session.places[k].turntable_angle_rad).translation for k in (0, -1)]
+    arc = next(item for item in scene["items"] if item.get("width") == 4)
+    for end in ends:
+        assert np.abs(np.asarray(arc["points"]) - end).max(axis=1).min() < 1e-3
 
 
 def test_report_without_covariance(good_run: TurntableRun) -> None:

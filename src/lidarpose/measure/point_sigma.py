@@ -26,6 +26,9 @@ def point_sigma(
     ----------
     points_camera : (N, M, 3)
         The assembled points of `recording`.
+    recording, calibration
+        Angles and ranges put right by the calibration, and the calibration as it is in the file. Of its further
+        parameters those count that move points: `encoder_scale`, `range_offset_m`, `range_scale`, `beam_angle_scale`.
     range_sigma_m
         Noise of a range; None adds none.
     world
@@ -37,19 +40,67 @@ def point_sigma(
     shape = points_camera.shape[:2]
     variance = np.full(shape, 0.0 if range_sigma_m is None else range_sigma_m**2)
     covariance = calibration.motion_covariance
+    extras = [name for name in _MOVING if name in calibration.parameter_names]
     if covariance is not None:
         angles = recording.turntable_angle_rad
         if recording.has_reading_per_beam:
             # The covariance changes by 1e-3 of itself over a sweep's part of the turn: one reading a sweep is enough.
             angles = angles.mean(axis=1)
+        motion = calibration.motion.in_true_angles
         for row, angle in enumerate(angles):
-            J = calibration.motion.pose_jacobian(float(angle))
+            J = motion.pose_jacobian(float(angle))
             variance[row] += moved_variance(J @ covariance @ J.T, points_camera[row])
+            if extras:
+                points = np.asarray(points_camera[row], dtype=np.float64)
+                variance[row] += _extra_variance(calibration, extras, recording.beam_angle_rad, float(angle), points, J)
     if world is not None:
         variance *= world.scale**2
         if world.covariance is not None:
             variance += moved_variance(world.covariance, world_points(points_camera, world))
     return np.asarray(np.sqrt(variance), dtype=np.float32)
+
+
+_MOVING = ("encoder_scale", "range_offset_m", "range_scale", "beam_angle_scale")
+
+
+def _extra_variance(
+    calibration: TurntableCalibration,
+    extras: list[str],
+    beam_rad: FloatArray,
+    angle_rad: float,
+    points: FloatArray,
+    J: FloatArray,
+) -> FloatArray:
+    """What further parameters add to the points' variance (M,), their correlation with the motion included."""
+    assert calibration.parameter_covariance is not None
+    at = [calibration.parameter_names.index(name) for name in extras]
+    C = calibration.parameter_covariance
+    by_extra = np.stack([_moved_by(name, calibration, beam_rad, angle_rad, points) for name in extras], axis=1)
+    by_motion = J[:3].T + np.cross(J[3:].T, points[:, None, :])
+    own = np.einsum("mka,kl,mla->m", by_extra, C[np.ix_(at, at)], by_extra)
+    return np.asarray(own + 2.0 * np.einsum("mja,jk,mka->m", by_motion, C[:10][:, at], by_extra, optimize=True))
+
+
+def _moved_by(
+    name: str, calibration: TurntableCalibration, beam_rad: FloatArray, angle_rad: float, points: FloatArray
+) -> FloatArray:
+    """Derivative (M, 3) of points by a further parameter."""
+    motion = calibration.motion.in_true_angles
+    if name == "encoder_scale":
+        scaled = calibration.motion
+        twist = scaled.T_camera_turntable.adjoint()[:, 5] * (
+            (angle_rad - scaled.reading_origin_rad) / scaled.reading_scale
+        )
+        return np.asarray(twist[:3] + np.cross(twist[3:], points))
+    pose = motion.pose(angle_rad)
+    along = points - pose.translation
+    if name == "range_scale":
+        return np.asarray(-along / calibration.beams.range_scale)
+    if name == "range_offset_m":
+        with np.errstate(invalid="ignore"):
+            return np.asarray(-along / np.linalg.norm(along, axis=-1, keepdims=True) / calibration.beams.range_scale)
+    stated = beam_rad / calibration.beams.angle_scale
+    return np.asarray(np.cross(pose.rotation[:, 2], along) * stated[:, None])
 
 
 def moved_variance(pose_covariance: FloatArray, points: NDArray[Any]) -> FloatArray:

@@ -31,8 +31,14 @@ def turntable_scene(run: TurntableRun) -> dict[str, Any]:
     _add_points(scene, run)
     _add_motion(scene, run, size)
     _add_lidar(scene, run, 0.35 * size)
-    table = motion.T_camera_turntable.matrix[:3].tolist()
-    return scene.data(front=(0.0, 0.0, 1.0), motion={"table": table, "step": _SIGMA_STEP_DEG, "sigma": _sigmas(run)})
+    turning = {
+        "table": motion.T_camera_turntable.matrix[:3].tolist(),
+        "scale": motion.reading_scale,
+        "origin": float(np.rad2deg(motion.reading_origin_rad)),
+        "step": _SIGMA_STEP_DEG,
+        "sigma": _sigmas(run),
+    }
+    return scene.data(front=(0.0, 0.0, 1.0), motion=turning)
 
 
 def _board_size(run: TurntableRun) -> float:
@@ -97,12 +103,14 @@ def _add_motion(scene: Scene, run: TurntableRun, size: float) -> None:
     axis = T @ np.array([[0.0, 0.0, -reach], [0.0, 0.0, reach]])
     scene.add("line", axis, "--axis", width=2)
     scene.label(axis[1], "turntable's axis", "--axis")
-    scene.add("line", _circle(motion, -180.0, 180.0), "--lidar", width=1.2, dash=[4, 5], alpha=0.8)
-    scene.add("line", _circle(motion, *arc_deg(run)), "--lidar", width=4)
+    low, high = (float(motion.true_angle(np.deg2rad(reading))) for reading in arc_deg(run))
+    scene.add("line", _circle(motion, -np.pi, np.pi), "--lidar", width=1.2, dash=[4, 5], alpha=0.8)
+    scene.add("line", _circle(motion, low, high), "--lidar", width=4)
 
 
-def _circle(motion: TurntableMotion, low_deg: float, high_deg: float) -> FloatArray:
-    angles = np.deg2rad(np.linspace(low_deg, high_deg, 73))
+def _circle(motion: TurntableMotion, low_rad: float, high_rad: float) -> FloatArray:
+    """Where the LiDAR's centre is while the table goes from one angle to another."""
+    angles = np.linspace(low_rad, high_rad, 73)
     arm = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(73)]) * motion.radius_m
     return motion.T_camera_turntable @ arm
 

@@ -94,15 +94,14 @@ def assemble_scan(
         )
     if options.never_stops and not recording.has_reading_per_beam:
         require_times(recording)
-    true_calibration = replace(calibration, motion=calibration.motion.in_true_angles)
-    motion = _fold_in(true_calibration.motion, world)
+    motion = _fold_in(calibration.motion.in_true_angles, world)
     compiled = pays_to_compile(recording)
 
     def cloud(first: int, part: SweepRecording) -> Cloud:
         if options.never_stops and not recording.has_reading_per_beam:
             part = replace(part, turntable_angle_deg=readings_between(recording, first, first + part.sweeps))
         part = in_true_angles(part, calibration)
-        return _cloud(part, first, true_calibration, options, world, motion, compiled)
+        return _cloud(part, first, calibration, options, world, motion, compiled)
 
     # One part is assembled while the one before is written.
     with ThreadPoolExecutor(1) as ahead:
@@ -154,7 +153,8 @@ def _cloud(
     compiled: bool,
 ) -> Cloud:
     in_camera = motion is None or (options.sigma and world is not None)
-    points = assemble(part, calibration.motion if motion is None or in_camera else motion, compiled=compiled)
+    true_motion = calibration.motion.in_true_angles
+    points = assemble(part, true_motion if motion is None or in_camera else motion, compiled=compiled)
     columns: dict[str, RealArray] = {}
     if options.intensity and part.intensity is not None:
         columns["intensity"] = np.asarray(part.intensity)

@@ -58,7 +58,9 @@
 
   function moved(item) {
     if (!item.moves || !slider) return item.points;
-    const a = slider.value * Math.PI / 180, c = Math.cos(a), s = Math.sin(a), M = data.motion.table;
+    const m = data.motion, M = m.table;
+    // The slider shows readings; the table stands where they say it does.
+    const a = (m.origin + m.scale * (slider.value - m.origin)) * Math.PI / 180, c = Math.cos(a), s = Math.sin(a);
     return item.points.map((p) => {
       const q = [c * p[0] - s * p[1], s * p[0] + c * p[1], p[2]];
       return [0, 1, 2].map((k) => M[k][0] * q[0] + M[k][1] * q[1] + M[k][2] * q[2] + M[k][3]);
