@@ -35,6 +35,17 @@ def median(values: FloatArray) -> float:
     return 0.5 * float(ordered[(n - 1) // 2] + ordered[n // 2])
 
 
+def row_medians(values: FloatArray, there: BoolArray) -> FloatArray:
+    """Median (L,) of those values (L, N) of each row that are there; NaN for a row without any."""
+    count = np.count_nonzero(there, axis=1)
+    if values.shape[1] == 0:
+        return np.full(len(values), np.nan)
+    ordered = np.sort(np.where(there, values, np.inf), axis=1)
+    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, values.shape[1] - 1)
+    rows = np.arange(len(values))
+    return np.asarray(np.where(count > 0, 0.5 * (ordered[rows, low] + ordered[rows, high]), np.nan))
+
+
 def chi2_tail(chi2: float, freedom: float) -> float:
     """Probability of a chi-squared of `freedom` > 0 degrees above `chi2`.
 

@@ -121,6 +121,18 @@ def _left_jacobian(w: FloatArray) -> FloatArray:
     return np.asarray(np.eye(3) + b[..., None, None] * W + c[..., None, None] * (W @ W))
 
 
+def exp_se3(twists: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Rotations (..., 3, 3) and translations (..., 3) of twists (..., 6) = (translation, rotation)."""
+    xi = np.asarray(twists, dtype=np.float64)
+    return exp_so3(xi[..., 3:]), (_left_jacobian(xi[..., 3:]) @ xi[..., :3, None])[..., 0]
+
+
+def log_se3(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """The twists (..., 6) of motions given as rotations (..., 3, 3) and translations (..., 3)."""
+    w = log_so3(rotation)
+    return np.concatenate([np.linalg.solve(_left_jacobian(w), translation[..., None])[..., 0], w], axis=-1)
+
+
 def _determinant(R: FloatArray) -> float:
     """Of a 3x3 matrix, without the detour through LAPACK."""
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()

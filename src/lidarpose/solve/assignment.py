@@ -30,7 +30,6 @@ from lidarpose.solve.assignment_candidates import (
     Pool,
     candidates_of,
     pool_of,
-    stripes_on_both_panels,
 )
 from lidarpose.solve.assignment_decision import decide
 from lidarpose.solve.assignment_solutions import Solution, solutions_of, support_of
@@ -103,14 +102,7 @@ def assign(
     """
     if panels is not None and not any(len(s) for place in places for s in place.stripes.values()):
         return _without_stripes(panels, panel_poses, places, first_panel)
-    reasons: dict[int, str] = {}
-    candidates: list[Candidate] = []
-    on_panels = stripes_on_both_panels(camera, panel_poses, places)
-    for k, place in enumerate(places):
-        try:
-            candidates += candidates_of(panel_poses[place.placement], k, place, on_panels.get(k))
-        except ValueError as reason:
-            reasons[k] = str(reason)
+    candidates, reasons = candidates_of(camera, panel_poses, places)
     angles = np.array([p.turntable_angle_rad for p in places])
     usable = sorted({c.place for c in candidates})
     _require_places(angles[usable], places, reasons)

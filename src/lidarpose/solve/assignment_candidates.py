@@ -8,16 +8,18 @@ from itertools import permutations
 
 import numpy as np
 
-from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
-from lidarpose.geometry.se3 import Pose, UncertainPose, log_so3, rotation_z
+from lidarpose.geometry.robust import median
+from lidarpose.geometry.se3 import UncertainPose
 from lidarpose.model.camera import Camera
 from lidarpose.model.observation import PlaceFeatures, ScanLine, StripePoints
-from lidarpose.solve.light_plane import StripeOnPanel, StripePair, stripe_pair, stripes_on_panel
-from lidarpose.solve.line_pair import FittedLine, fit_line_pair, fit_scan_line, free_directions
+from lidarpose.solve.light_plane import StripeOnPanel, StripePair, fit_light_planes, stripe_pair, stripes_on_panel
+from lidarpose.solve.line_pair import FittedLine, FittedLines, fit_line_pairs, fit_scan_lines, leaving_directions
 from lidarpose.solve.panel_pose import PanelPose
-from lidarpose.solve.single_pose import single_pose
+from lidarpose.solve.single_pose import single_poses
 from lidarpose.solve.turntable_function import (
+    Motions,
     information_in_own_frame,
 )
 
@@ -59,42 +61,92 @@ class Pool:
     information: FloatArray
     places: int
 
-    def misfits(self, T_w: Pose, T_m: Pose) -> FloatArray:
-        """Distance (C,) of each candidate from a motion, in its own sigmas."""
-        turned = T_w.rotation @ rotation_z(self.angle_rad)
-        back = np.swapaxes(turned @ T_m.rotation, -1, -2)
-        shift = self.translation - (turned @ T_m.translation + T_w.translation)
-        e = np.concatenate([(back @ shift[..., None])[..., 0], log_so3(back @ self.rotation)], axis=1)
-        return np.asarray(np.sqrt(np.einsum("na,nab,nb->n", e, self.information, e) / 6.0))
+    def misfits(self, motions: Motions) -> FloatArray:
+        """Distances (M, C) of the candidates from each motion, in their own sigmas."""
+        e = motions.residuals(self.angle_rad, self.rotation, self.translation)
+        weighted = (e[:, :, None] @ self.information)[:, :, 0]
+        return np.asarray(np.sqrt((weighted * e).sum(axis=2) / 6.0))
 
 
 def candidates_of(
-    poses: Sequence[PanelPose],
-    index: int,
-    place: PlaceFeatures,
-    on_panels: tuple[StripeOnPanel, StripeOnPanel] | None,
+    camera: Camera, panel_poses: Mapping[str, Sequence[PanelPose]], places: Sequence[PlaceFeatures]
+) -> tuple[list[Candidate], dict[int, str]]:
+    """Ordered pairs of the places' lines that may be the board; for places without any, by index, the reason."""
+    reasons: dict[int, str] = {}
+    planes = {name: [Plane.from_pose(p.T_camera_panel) for p in poses] for name, poses in panel_poses.items()}
+    on_panels = stripes_on_both_panels(camera, panel_poses, places)
+    stripes = _stripe_pairs(planes, places, on_panels, reasons)
+    fits = fit_scan_lines([line for place in places for line in place.lines], robust=False)
+    first_line = np.cumsum([0, *(len(place.lines) for place in places)]).tolist()
+    pairs: list[tuple[int, int, int]] = []
+    for k, place in enumerate(places):
+        if k not in reasons and len(place.lines) < 2:
+            reasons[k] = f"the scan shows {len(place.lines)} straight lines; the board needs two"
+        if k not in reasons:
+            pairs += [(k, i, j) for i, j in permutations(range(len(place.lines)), 2)]
+    found = _candidates(planes, places, stripes, on_panels, fits, first_line, pairs)
+    for k in set(range(len(places))) - {c.place for c in found} - reasons.keys():
+        reasons[k] = "no two lines of the scan match the two stripes in angle, length and side"
+    return found, reasons
+
+
+def _stripe_pairs(
+    planes: Mapping[str, Sequence[Plane]],
+    places: Sequence[PlaceFeatures],
+    on_panels: Mapping[int, tuple[StripeOnPanel, StripeOnPanel]],
+    reasons: dict[int, str],
+) -> dict[int, StripePair]:
+    """Light plane and stripes by the place's index; where there are none, the reason is added to `reasons`."""
+    found: dict[int, StripePair] = {}
+    lit = list(on_panels)
+    for k, light in zip(lit, fit_light_planes([on_panels[k] for k in lit]), strict=True):
+        first, second = planes[places[k].placement][:2]
+        try:
+            if isinstance(light, ValueError):
+                raise light
+            found[k] = stripe_pair((first, second), on_panels[k], light)
+        except ValueError as reason:
+            reasons[k] = str(reason)
+    for k, place in enumerate(places):
+        if k not in on_panels:
+            missing = next(key for key in (0, 1) if not _has_stripe(place, key))
+            reasons[k] = f"no usable stripe on panel {missing + 1}"
+    return found
+
+
+def _candidates(
+    planes: Mapping[str, Sequence[Plane]],
+    places: Sequence[PlaceFeatures],
+    stripes: Mapping[int, StripePair],
+    on_panels: Mapping[int, tuple[StripeOnPanel, StripeOnPanel]],
+    fits: FittedLines,
+    first_line: Sequence[int],
+    pairs: Sequence[tuple[int, int, int]],
 ) -> list[Candidate]:
-    """Ordered pairs of a place's lines that may be the board. Raises ValueError with the reason if there is none."""
-    panels = [Plane.from_pose(p.T_camera_panel) for p in poses]
-    if on_panels is None:
-        missing = next(key for key in (0, 1) if not _has_stripe(place, key))
-        raise ValueError(f"no usable stripe on panel {missing + 1}")
-    stripes = stripe_pair((panels[0], panels[1]), on_panels)
-    rays = (on_panels[0].rays_camera, on_panels[1].rays_camera)
-    if len(place.lines) < 2:
-        raise ValueError(f"the scan shows {len(place.lines)} straight lines; the board needs two")
-    fits = [fit_scan_line(line, robust=False) for line in place.lines]
+    """Of pairs (place, line, line), those that may be the board."""
+    if not pairs:
+        return []
+    ones = [fits.take(np.array([first_line[pair[0]] + pair[side] for pair in pairs])) for side in (1, 2)]
+    alpha = np.array([stripes[k].alpha_rad for k, _, _ in pairs])
+    extents = np.array([stripes[k].extents_m for k, _, _ in pairs])
+    kept = np.flatnonzero(_plausible(ones[0], ones[1], alpha, extents))
+    pairs = [pairs[c] for c in kept.tolist()]
+    lines = fit_line_pairs(ones[0].take(kept), ones[1].take(kept), alpha[kept])
+    samples = single_poses([stripes[k] for k, _, _ in pairs], lines)
+    single = {}
     found = []
-    for i, j in _plausible_pairs(fits, stripes):
-        lines = fit_line_pair(fits[i], fits[j], stripes.alpha_rad)
-        sample = single_pose(stripes, lines)
-        centre = sample.pose.translation
+    for c, (k, i, j) in enumerate(pairs):
+        centre = samples[c].pose.translation
         # The panels show their faces to the camera, at the origin: the LiDAR must stand on the same side.
-        if all(plane.distance(centre) * -plane.offset > 0.0 for plane in panels):
-            spacing = max(_spacing(place.lines[i]), _spacing(place.lines[j]))
-            found.append(Candidate(index, (i, j), sample, lines.extents_m, spacing, (fits[i], fits[j]), stripes, rays))
-    if not found:
-        raise ValueError("no two lines of the scan match the two stripes in angle, length and side")
+        if all(plane.distance(centre) * -plane.offset > 0.0 for plane in planes[places[k].placement]):
+            for line in (i, j):
+                if (k, line) not in single:
+                    single[k, line] = fits.one(first_line[k] + line), _spacing(places[k].lines[line])
+            (fit_i, spacing_i), (fit_j, spacing_j) = single[k, i], single[k, j]
+            spacing, rays = max(spacing_i, spacing_j), (on_panels[k][0].rays_camera, on_panels[k][1].rays_camera)
+            found.append(
+                Candidate(k, (i, j), samples[c], lines.extents_m[c], spacing, (fit_i, fit_j), stripes[k], rays)
+            )
     return found
 
 
@@ -126,39 +178,29 @@ def _thinned(stripe: StripePoints) -> StripePoints:
     return StripePoints(stripe.pixels[some], stripe.normals[some], stripe.sigma_px[some])
 
 
-def _plausible_pairs(fits: list[FittedLine], stripes: StripePair) -> list[tuple[int, int]]:
-    return [(i, j) for i, j in permutations(range(len(fits)), 2) if _plausible(fits[i], fits[j], stripes)]
+def _plausible(first: FittedLines, second: FittedLines, alpha: FloatArray, extents: FloatArray) -> BoolArray:
+    """Angle, gap at the fold and lengths of pairs of lines (C,) against the stripes': angle (C,), extents (C, 2, 2).
 
-
-def _plausible(first: FittedLine, second: FittedLine, stripes: StripePair) -> bool:
-    """Angle, gap at the fold and lengths of two lines against the stripes' (all as loose as sensors and edges are)."""
-    cosine = abs(float(first.line.direction @ second.line.direction))
-    sigma = float(np.hypot(first.direction_sigma_rad, second.direction_sigma_rad))
-    slack = 5.0 * sigma + ALPHA_SLACK_RAD
-    # Cheap first: the lines' directions without their senses.
-    if abs(np.arccos(min(cosine, 1.0)) - min(stripes.alpha_rad, np.pi - stripes.alpha_rad)) > slack:
-        return False
-    try:
-        directions = free_directions(first, second)
-    except ValueError:
-        return False
-    alpha = float(np.arccos(np.clip(directions[0] @ directions[1], -1.0, 1.0)))
-    if abs(alpha - stripes.alpha_rad) > slack:
-        return False
-    E = first.line.intersection(second.line)
-    for fit, direction, (near, far) in zip((first, second), directions, stripes.extents_m, strict=True):
-        low, high = np.sort((fit.ends - E) @ direction)
-        common = min(high, far) - max(low, near)
-        if low < -FOLD_SLACK_M - 0.1 * (high - low):
-            return False
-        if common < LEAST_STRIPE_COVERED * (far - near) or common < LEAST_LINE_COVERED * (high - low):
-            return False
-    return True
+    All as loose as sensors and edges are.
+    """
+    E, directions = leaving_directions(first, second)
+    between = np.arccos(np.clip((directions[:, 0] * directions[:, 1]).sum(axis=1), -1.0, 1.0))
+    slack = 5.0 * np.hypot(first.direction_sigma_rad, second.direction_sigma_rad) + ALPHA_SLACK_RAD
+    # Comparisons with NaN, of lines that are parallel, are false.
+    good = np.abs(between - alpha) <= slack
+    for k, fit in enumerate((first, second)):
+        along = np.sort(((fit.ends - E[:, None]) @ directions[:, k, :, None])[..., 0], axis=1)
+        (low, high), (near, far) = along.T, extents[:, k].T
+        common = np.minimum(high, far) - np.maximum(low, near)
+        good &= low >= -FOLD_SLACK_M - 0.1 * (high - low)
+        good &= common >= LEAST_STRIPE_COVERED * (far - near)
+        good &= common >= LEAST_LINE_COVERED * (high - low)
+    return np.asarray(good)
 
 
 def _spacing(line: ScanLine) -> float:
     """Typical distance of neighbouring points of a scan line."""
-    return float(np.median(np.linalg.norm(np.diff(line.points_lidar(), axis=0), axis=1)))
+    return median(np.linalg.norm(np.diff(line.points_lidar(), axis=0), axis=1))
 
 
 def pool_of(candidates: list[Candidate], angles: FloatArray) -> Pool:

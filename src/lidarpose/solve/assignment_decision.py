@@ -6,21 +6,19 @@ The rival is mostly the mirrored solution, with both lines exchanged at every pl
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from lidarpose.errors import InputError, UndeterminedError
-from lidarpose.geometry.arrays import FloatArray, IntArray, angle_between
-from lidarpose.geometry.planes import Plane, fit_plane, intersect_three_planes
-from lidarpose.geometry.se3 import Pose
+from lidarpose.geometry.arrays import FloatArray, IntArray, angle_between, unit
+from lidarpose.geometry.se3 import Pose, exp_se3, log_se3
 from lidarpose.model.observation import PlaceFeatures
 from lidarpose.solve.assignment_candidates import Candidate, Pool
 from lidarpose.solve.assignment_solutions import Solution, is_same, rms_misfit, support_of
-from lidarpose.solve.line_pair import fit_line_pair
+from lidarpose.solve.line_pair import FittedLines, fit_line_pairs
 from lidarpose.solve.panel_pose import PanelPose
-from lidarpose.solve.single_pose import single_pose
+from lidarpose.solve.single_pose import rotations_and_centres
 
 # One solution beats another where its residuals are this much smaller at least, and that is no chance: the logarithm of
 # the ratio of two equal deviations with n degrees of freedom scatters by sqrt(1/n) (more for small n).
@@ -151,16 +149,17 @@ def _rms_with_panels(
     names = sorted({places[k].placement for k in which})
     chosen = solution.chosen[which]
     rows, right = [], []
-    for k, c in zip(which, chosen, strict=True):
-        candidate = pool.candidates[c]
-        poses = panel_poses[places[k].placement]
+    candidates = [pool.candidates[c] for c in chosen]
+    moved = _moved_by_panels(candidates, [panel_poses[places[k].placement] for k in which])
+    for k, c, candidate, by_panel in zip(which, chosen, candidates, moved, strict=True):
         to_motion = solution.motion.pose_jacobian(pool.angle_rad[c])
-        back = solution.motion.pose(pool.angle_rad[c]).inverse().adjoint()
+        pose = solution.motion.pose(pool.angle_rad[c])
+        back = pose.inverse().adjoint()
         root = np.linalg.cholesky(pool.information[c]).T
-        e = back @ candidate.sample.pose.minus(solution.motion.pose(pool.angle_rad[c]))
+        e = back @ candidate.sample.pose.minus(pose)
         by_panels = np.zeros((6, 12 * len(names)))
         at = 12 * names.index(places[k].placement)
-        by_panels[:, at : at + 12] = back @ _moved_by_panels(candidate, poses)
+        by_panels[:, at : at + 12] = back @ by_panel
         rows.append(root @ np.hstack([-back @ to_motion, by_panels]))
         right.append(root @ e)
     prior = np.hstack([np.zeros((12 * len(names), 10)), np.eye(12 * len(names))])
@@ -170,40 +169,66 @@ def _rms_with_panels(
     return float(np.sqrt(rest @ rest / (6 * len(which))))
 
 
-def _moved_by_panels(candidate: Candidate, poses: Sequence[PanelPose]) -> FloatArray:
-    """How a sample moves (6, 12), as left perturbation, for one deviation of each panel's pose in each direction."""
-    T = [poses[key].T_camera_panel for key in (0, 1)]
-    reference = _sample_on(candidate, (T[0], T[1]))
-    columns = []
+def _moved_by_panels(candidates: Sequence[Candidate], poses: Sequence[Sequence[PanelPose]]) -> FloatArray:
+    """How samples move (C, 6, 12), as left perturbation, for one deviation of each panel's pose in each direction."""
+    panels = [_panels_moved(candidate, own) for candidate, own in zip(candidates, poses, strict=True)]
+    R, t = _samples_on(candidates, np.stack([p[0] for p in panels]), np.stack([p[1] for p in panels]))
+    back = np.swapaxes(R[:, :1], -1, -2)
+    turn = R[:, 1:] @ back
+    shift = t[:, 1:] - (turn @ t[:, :1, :, None])[..., 0]
+    return np.asarray(np.swapaxes(log_se3(turn, shift), 1, 2) / _SMALL_SHARE)
+
+
+_SMALL_SHARE = 0.1
+
+
+def _panels_moved(candidate: Candidate, poses: Sequence[PanelPose]) -> tuple[FloatArray, FloatArray]:
+    """Planes of both panels as they are and moved in twelve ways: normals (13, 2, 3), offsets (13, 2)."""
+    normals, offsets = np.empty((13, 2, 3)), np.empty((13, 2))
     for key in (0, 1):
+        T = poses[key].T_camera_panel
         middle = Pose(np.eye(3), candidate.stripes.E_camera).adjoint()
         slack = np.diag([PANEL_SHIFT_M**2] * 3 + [PANEL_TURN_RAD**2] * 3)
         spread = np.linalg.cholesky(4.0 * poses[key].covariance + middle @ slack @ middle.T)
-        for direction in 0.1 * spread.T:
-            moved = list(T)
-            moved[key] = Pose.exp(direction) @ T[key]
-            columns.append(_sample_on(candidate, (moved[0], moved[1])).minus(reference) / 0.1)
-    return np.stack(columns, axis=1)
+        normal = T.rotation[:, 2]
+        normals[:, key], offsets[:, key] = normal, normal @ T.translation
+        turn, shift = exp_se3(_SMALL_SHARE * spread.T)
+        own = slice(1 + 6 * key, 7 + 6 * key)
+        normals[own, key] = turn @ normal
+        offsets[own, key] = (normals[own, key] * (turn @ T.translation + shift)).sum(axis=1)
+    return normals, offsets
 
 
-def _sample_on(candidate: Candidate, T_camera_panel: tuple[Pose, Pose]) -> Pose:
-    """The sample as it were if the panels stood a little differently."""
-    planes = (Plane.from_pose(T_camera_panel[0]), Plane.from_pose(T_camera_panel[1]))
-    points = np.vstack([p.intersect_rays(r) for p, r in zip(planes, candidate.rays_camera, strict=True)])
-    stripes = candidate.stripes
-    light = fit_plane(points, np.concatenate(stripes.light_plane.weights))
-    directions = []
-    for plane, old in zip(planes, stripes.directions_camera, strict=True):
-        direction = light.intersect_plane(plane).direction
-        directions.append(direction if direction @ old > 0.0 else -direction)
-    moved = replace(
-        stripes,
-        light_plane=replace(stripes.light_plane, plane=light),
-        E_camera=intersect_three_planes((*planes, light)),
-        directions_camera=np.stack(directions),
-        alpha_rad=float(angle_between(*directions)),
-    )
-    return single_pose(moved, fit_line_pair(*candidate.fits, moved.alpha_rad)).pose
+def _samples_on(
+    candidates: Sequence[Candidate], normals: FloatArray, offsets: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Rotations (C, K, 3, 3) and centres (C, K, 3) of samples on panels that stand a little differently, K ways."""
+    C, K = offsets.shape[:2]
+    light_normal, light_offset = np.empty((C, K, 3)), np.empty((C, K))
+    for c, candidate in enumerate(candidates):
+        points = np.concatenate(
+            [
+                offsets[c, :, key, None, None] / (normals[c, :, key] @ rays.T)[..., None] * rays
+                for key, rays in enumerate(candidate.rays_camera)
+            ],
+            axis=1,
+        )
+        weights = np.concatenate(candidate.stripes.light_plane.weights)
+        mean = weights @ points / weights.sum()
+        d = (points - mean[:, None]) * np.sqrt(weights)[:, None]
+        light_normal[c] = np.linalg.eigh(np.swapaxes(d, 1, 2) @ d)[1][:, :, 0]
+        light_offset[c] = (light_normal[c] * mean).sum(axis=1)
+    old = np.array([c.stripes.directions_camera for c in candidates])[:, None]
+    directions = unit(np.cross(light_normal[:, :, None], normals))
+    directions = directions * np.where((directions * old).sum(axis=-1) > 0.0, 1.0, -1.0)[..., None]
+    three = np.concatenate([normals, light_normal[:, :, None]], axis=2)
+    right = np.concatenate([offsets, light_offset[..., None]], axis=2)
+    E = np.linalg.solve(three, right[..., None])[..., 0]
+    alpha = angle_between(directions[:, :, 0], directions[:, :, 1]).ravel()
+    which = np.repeat(np.arange(C), K)
+    first, second = (FittedLines.of([c.fits[side] for c in candidates]).take(which) for side in (0, 1))
+    R, t = rotations_and_centres(E.reshape(-1, 3), directions.reshape(-1, 2, 3), fit_line_pairs(first, second, alpha))
+    return R.reshape(C, K, 3, 3), t.reshape(C, K, 3)
 
 
 def _ends_gain(pool: Pool, best: Solution, rival: Solution) -> float:

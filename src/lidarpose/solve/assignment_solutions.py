@@ -16,8 +16,9 @@ from lidarpose.geometry.se3 import log_so3
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.solve.assignment_candidates import Pool
 from lidarpose.solve.turntable_function import (
+    Motions,
     fit_by_readings,
-    motion_of_pair,
+    motions_of_pairs,
     wide_pairs,
 )
 
@@ -92,34 +93,40 @@ def _hypotheses(pool: Pool) -> list[tuple[float, IntArray, TurntableMotion]]:
     present = np.unique(pool.place)
     angle_of = {int(p): pool.angle_rad[pool.place == p][0] for p in present}
     pairs = wide_pairs(np.array([angle_of[int(p)] for p in present]), PAIRS)
+    both = [
+        (int(a), int(b))
+        for i, j in pairs
+        for a in np.flatnonzero(pool.place == present[i])
+        for b in np.flatnonzero(pool.place == present[j])
+    ]
+    two = np.array(both, dtype=np.int64).reshape(-1, 2)
+    two = two[_turn_agrees(pool, two)]
+    if len(two) == 0:
+        return []
+    motions = motions_of_pairs(pool.angle_rad[two], pool.rotation[two], pool.translation[two])
     scored: list[tuple[float, IntArray, TurntableMotion]] = []
-    for i, j in pairs:
-        for a in np.flatnonzero(pool.place == present[i]):
-            for b in np.flatnonzero(pool.place == present[j]):
-                if not _turn_agrees(pool, int(a), int(b)):
-                    continue
-                both = [int(a), int(b)]
-                motion = motion_of_pair(pool.angle_rad[both], pool.rotation[both], pool.translation[both])
-                chosen, misfit = _choose(pool, pool.misfits(*motion))
-                scored.append((_score(misfit), chosen, TurntableMotion.from_any_frame(*motion)))
+    for k, misfits in enumerate(pool.misfits(motions)):
+        chosen, misfit = _choose(pool, misfits)
+        scored.append((_score(misfit), chosen, TurntableMotion.from_any_frame(*motions.one(k))))
     return scored
 
 
-def _turn_agrees(pool: Pool, a: int, b: int) -> bool:
-    """Whether the LiDAR turned between two candidates by as much as the table did."""
-    turned = float(np.linalg.norm(log_so3(pool.rotation[b] @ pool.rotation[a].T)))
-    table = abs(float((pool.angle_rad[b] - pool.angle_rad[a] + np.pi) % (2.0 * np.pi) - np.pi))
-    sigma = np.sqrt(sum(np.trace(pool.candidates[k].sample.rotation_covariance()) for k in (a, b)))
-    return bool(abs(turned - table) < np.deg2rad(1.0) + 6.0 * float(sigma))
+def _turn_agrees(pool: Pool, two: IntArray) -> BoolArray:
+    """Whether the LiDAR turned between two candidates (M, 2) by as much as the table did."""
+    a, b = two.T
+    turned = np.linalg.norm(log_so3(pool.rotation[b] @ np.swapaxes(pool.rotation[a], 1, 2)), axis=1)
+    table = np.abs((pool.angle_rad[b] - pool.angle_rad[a] + np.pi) % (2.0 * np.pi) - np.pi)
+    variance = np.array([np.trace(c.sample.rotation_covariance()) for c in pool.candidates])
+    return np.asarray(np.abs(turned - table) < np.deg2rad(1.0) + 6.0 * np.sqrt(variance[a] + variance[b]))
 
 
 def _choose(pool: Pool, misfits: FloatArray) -> tuple[IntArray, FloatArray]:
     """Each place's candidate of least misfit (-1 where it has none), and that misfit."""
     chosen: IntArray = np.full(pool.places, -1, dtype=np.int64)
     misfit = np.full(pool.places, np.inf)
-    for c in np.argsort(-misfits):  # the least comes last and stays
-        chosen[pool.place[c]] = c
-        misfit[pool.place[c]] = misfits[c]
+    order = np.argsort(-misfits)  # the least comes last and stays
+    chosen[pool.place[order]] = order
+    misfit[pool.place[order]] = misfits[order]
     return chosen, misfit
 
 
@@ -139,7 +146,7 @@ def _refined(
             )
         except UndeterminedError:
             return solution
-        misfits = pool.misfits(fitted.motion.T_camera_turntable, fitted.motion.T_turntable_lidar)
+        misfits = pool.misfits(Motions.of(fitted.motion))[0]
         if rechoose:
             again, misfit = _choose(pool, misfits)
         else:

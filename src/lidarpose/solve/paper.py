@@ -15,10 +15,10 @@ from lidarpose.geometry.se3 import UncertainPose
 from lidarpose.model.camera import Camera
 from lidarpose.model.observation import LeftOut, PanelCorners, PlaceObservation, TurntableObservations
 from lidarpose.model.turntable import TurntableMotion
-from lidarpose.solve.light_plane import StripePair, stripe_on_panel, stripe_pair
-from lidarpose.solve.line_pair import fit_line_pair, fit_scan_line
+from lidarpose.solve.light_plane import StripePair, fit_light_planes, stripe_on_panel, stripe_pair
+from lidarpose.solve.line_pair import fit_line_pairs, fit_scan_lines
 from lidarpose.solve.panel_pose import PanelPose, panel_pose
-from lidarpose.solve.single_pose import single_pose
+from lidarpose.solve.single_pose import single_poses
 from lidarpose.solve.turntable_function import (
     FunctionDeviations,
     fit_by_circles,
@@ -62,6 +62,7 @@ def solve_paper(
     *,
     function: Literal["readings", "circles"] = "readings",
     stripe_pairs: Mapping[str, StripePair] | None = None,
+    panel_poses: Mapping[str, tuple[PanelPose, ...]] | None = None,
 ) -> PaperSolution:
     """Sections 1 and 2 of the paper.
 
@@ -74,6 +75,8 @@ def solve_paper(
     stripe_pairs
         By position, light planes and stripes that were fitted to these observations before (by `assign`); those of
         other places are fitted here.
+    panel_poses
+        By placement, as `board_poses` finds them, if they are known.
 
     Raises
     ------
@@ -87,19 +90,10 @@ def solve_paper(
             "placements of the board and use the joint estimate",
             details=tuple(f"{item.what}: {item.reason}" for item in observations.left_out),
         )
-    panel_poses = {name: board_poses(observations.camera, c, name) for name, c in observations.corners.items()}
-    samples: dict[str, UncertainPose] = {}
-    angles: list[float] = []
-    left_out: list[LeftOut] = []
-    for place in observations.places:
-        try:
-            known = (stripe_pairs or {}).get(place.position)
-            sample = sample_pose(observations, panel_poses[place.placement], place, known)
-        except ValueError as reason:
-            left_out.append(LeftOut(f"position {place.position}", str(reason)))
-            continue
-        samples[place.position] = sample
-        angles.append(place.turntable_angle_rad)
+    if panel_poses is None:
+        panel_poses = {name: board_poses(observations.camera, c, name) for name, c in observations.corners.items()}
+    samples, left_out = _samples(observations, panel_poses, stripe_pairs or {})
+    angles = [place.turntable_angle_rad for place in observations.places if place.position in samples]
     details = tuple(f"{item.what}: {item.reason}" for item in (*observations.left_out, *left_out))
     try:
         require_readings(np.array(angles))
@@ -145,26 +139,66 @@ def board_poses(camera: Camera, corners: Sequence[PanelCorners], placement: str 
     return poses
 
 
-def sample_pose(
+def _samples(
     observations: TurntableObservations,
-    panel_poses: tuple[PanelPose, ...],
-    place: PlaceObservation,
-    stripes: StripePair | None = None,
-) -> UncertainPose:
-    """T_camera_lidar at one place (section 1); `stripes` if they are fitted already.
+    panel_poses: Mapping[str, Sequence[PanelPose]],
+    known: Mapping[str, StripePair],
+) -> tuple[dict[str, UncertainPose], list[LeftOut]]:
+    """T_camera_lidar at each place (section 1), by position; and the places that have none, with the reason.
 
-    Raises ValueError with the reason if it cannot be found.
+    `known`: stripes that are fitted already, by position.
     """
+    stripes, reasons = _stripes(observations, panel_poses, known)
+    left_out = [LeftOut(f"position {position}", reason) for position, reason in reasons.items()]
+    places = [place for place in observations.places if place.position in stripes]
+    if not places:
+        return {}, left_out
+    fits = fit_scan_lines([place.scan_lines[key] for key in (0, 1) for place in places])
+    first = np.arange(len(places))
+    own = [stripes[place.position] for place in places]
+    alpha = np.array([s.alpha_rad for s in own])
+    lines = fit_line_pairs(fits.take(first), fits.take(first + len(places)), alpha)
+    usable = np.flatnonzero(np.isfinite(lines.E_lidar).all(axis=1))
+    found = single_poses([own[k] for k in usable], lines.take(usable))
+    parallel = np.setdiff1d(first, usable)
+    left_out += [LeftOut(f"position {places[k].position}", "its two scan lines are parallel") for k in parallel]
+    return {places[k].position: sample for k, sample in zip(usable, found, strict=True)}, left_out
+
+
+def _stripes(
+    observations: TurntableObservations,
+    panel_poses: Mapping[str, Sequence[PanelPose]],
+    known: Mapping[str, StripePair],
+) -> tuple[dict[str, StripePair], dict[str, str]]:
+    """Both stripes of each place that can be used, by position, fitted unless `known`; and why others cannot."""
+    reasons = {p.position: reason for p in observations.places if (reason := _missing(p)) is not None}
+    usable = [p for p in observations.places if p.position not in reasons]
+    found = {p.position: known[p.position] for p in usable if p.position in known}
+    new = [p for p in usable if p.position not in known]
+    on_panels = []
+    for place in new:
+        poses = [panel_poses[place.placement][key].T_camera_panel for key in (0, 1)]
+        first, second = (stripe_on_panel(observations.camera, poses[k], place.stripes[k]) for k in (0, 1))
+        on_panels.append((first, second))
+    for place, points, light in zip(new, on_panels, fit_light_planes(on_panels), strict=True):
+        first_panel, second_panel = (Plane.from_pose(p.T_camera_panel) for p in panel_poses[place.placement][:2])
+        try:
+            if isinstance(light, ValueError):
+                raise light
+            found[place.position] = stripe_pair((first_panel, second_panel), points, light)
+        except ValueError as reason:
+            reasons[place.position] = str(reason)
+    for position, pair in list(found.items()):
+        if min(pair.alpha_rad, np.pi - pair.alpha_rad) < LEAST_ANGLE_RAD:
+            reasons[position] = "the two stripes are nearly parallel, so the LiDAR may slide along them"
+            del found[position]
+    return found, reasons
+
+
+def _missing(place: PlaceObservation) -> str | None:
     for key in (0, 1):
         if key not in place.stripes or len(place.stripes[key]) < LEAST_STRIPE_POINTS:
-            raise ValueError(f"no usable stripe on panel {key + 1}")
+            return f"no usable stripe on panel {key + 1}"
         if key not in place.scan_lines or len(place.scan_lines[key]) < LEAST_SCAN_POINTS:
-            raise ValueError(f"no usable scan line on panel {key + 1}")
-    if stripes is None:
-        poses = [panel_poses[key].T_camera_panel for key in (0, 1)]
-        points = [stripe_on_panel(observations.camera, poses[key], place.stripes[key]) for key in (0, 1)]
-        stripes = stripe_pair((Plane.from_pose(poses[0]), Plane.from_pose(poses[1])), (points[0], points[1]))
-    if min(stripes.alpha_rad, np.pi - stripes.alpha_rad) < LEAST_ANGLE_RAD:
-        raise ValueError("the two stripes are nearly parallel, so the LiDAR may slide along them")
-    lines = fit_line_pair(fit_scan_line(place.scan_lines[0]), fit_scan_line(place.scan_lines[1]), stripes.alpha_rad)
-    return single_pose(stripes, lines)
+            return f"no usable scan line on panel {key + 1}"
+    return None

@@ -201,40 +201,65 @@ def require_readings(angles: FloatArray) -> None:
 
 def _start_from_pairs(angles: FloatArray, R: FloatArray, t: FloatArray) -> tuple[Pose, Pose]:
     """The motion of the pair of places that most places agree with (least median)."""
-    best: tuple[float, Pose, Pose] | None = None
-    for i, j in wide_pairs(angles):
-        T_w, T_m = motion_of_pair(angles[[i, j]], R[[i, j]], t[[i, j]])
-        e = _residuals(angles, R, t, T_w, T_m)
-        # A radian counts as a metre: scores are only compared among the pairs of one session.
-        score = float(np.median(np.einsum("na,na->n", e, e)))
-        if best is None or score < best[0]:
-            best = (score, T_w, T_m)
-    assert best is not None
-    return best[1], best[2]
+    pairs = np.array(wide_pairs(angles))
+    motions = motions_of_pairs(angles[pairs], R[pairs], t[pairs])
+    e = motions.residuals(angles, R, t)
+    # A radian counts as a metre: scores are only compared among the pairs of one session.
+    return motions.one(int(np.argmin(np.median((e * e).sum(axis=2), axis=1))))
 
 
-def motion_of_pair(angles: FloatArray, R: FloatArray, t: FloatArray) -> tuple[Pose, Pose]:
-    """The turning motion T_w @ Rz(reading) @ T_m through two poses: `R` (2, 3, 3), `t` (2, 3)."""
-    R_w = _frame_about(motion_axis(R[0], R[1], float(angles[1] - angles[0])), np.zeros(3)).rotation
-    turns = R_w @ rotation_z(angles)
-    R_m = (np.swapaxes(turns, -1, -2) @ R).sum(axis=0)
-    # t_i = point + turned arm, the arm along x and y of the turntable's frame.
-    rows = np.concatenate([np.broadcast_to(np.eye(3), (2, 3, 3)), turns[:, :, :2]], axis=2).reshape(6, 5)
-    mean = t.mean(axis=0)
-    solution = np.linalg.lstsq(rows, (t - mean).ravel(), rcond=1e-12)[0]
-    arm = np.array([solution[3], solution[4], 0.0])
-    return Pose(R_w, solution[:3] + mean), Pose(nearest_rotation(R_m), arm)
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Turning motions ``T_w @ Rz(reading) @ T_m``: rotations (M, 3, 3) and translations (M, 3) of both factors."""
+
+    R_w: FloatArray
+    t_w: FloatArray
+    R_m: FloatArray
+    t_m: FloatArray
+
+    @staticmethod
+    def of(motion: TurntableMotion) -> Motions:
+        """A single one."""
+        T_w, T_m = motion.T_camera_turntable, motion.T_turntable_lidar
+        return Motions(*(array[None] for array in (T_w.rotation, T_w.translation, T_m.rotation, T_m.translation)))
+
+    def one(self, k: int) -> tuple[Pose, Pose]:
+        return Pose(self.R_w[k], self.t_w[k]), Pose(self.R_m[k], self.t_m[k])
+
+    def residuals(self, angles: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
+        """Residuals (M, N, 6) of N poses from each motion in the LiDAR's own frame: translation, rotation."""
+        turned = self.R_w[:, None] @ rotation_z(angles)
+        back = np.swapaxes(turned @ self.R_m[:, None], -1, -2)
+        shift = t - ((turned @ self.t_m[:, None, :, None])[..., 0] + self.t_w[:, None])
+        return np.concatenate([(back @ shift[..., None])[..., 0], log_so3(back @ R)], axis=2)
 
 
-def motion_axis(R_first: FloatArray, R_second: FloatArray, turn_rad: float) -> FloatArray:
-    """Unit axis (3,) of the turn by `turn_rad` (signed, not a multiple of a whole turn) from one rotation to another.
+def motions_of_pairs(angles: FloatArray, R: FloatArray, t: FloatArray) -> Motions:
+    """The turning motions through two poses each: readings (M, 2), `R` (M, 2, 3, 3), `t` (M, 2, 3).
 
-    At half a turn the sense cannot be seen from two rotations; then either is returned.
+    The axis is that of the turn from one rotation to the other, with the sense that the readings give; at half a turn
+    the sense cannot be seen from two rotations, and then it is either.
     """
-    moved = R_second @ R_first.T
-    vector = log_so3(moved)
-    folded = (turn_rad + np.pi) % (2.0 * np.pi) - np.pi
-    return np.asarray(unit(vector if folded >= 0.0 else -vector))
+    vector = log_so3(R[:, 1] @ np.swapaxes(R[:, 0], 1, 2))
+    folded = (angles[:, 1] - angles[:, 0] + np.pi) % (2.0 * np.pi) - np.pi
+    length = np.linalg.norm(vector, axis=1)
+    signed = np.where(folded >= 0.0, 1.0, -1.0) / np.where(length > 0.0, length, 1.0)
+    R_w = _frames_about(np.where(length[:, None] > 0.0, signed[:, None] * vector, [0.0, 0.0, 1.0]))
+    turns = R_w[:, None] @ rotation_z(angles)
+    R_m = (np.swapaxes(turns, -1, -2) @ R).sum(axis=1)
+    # t_i = point + turned arm, the arm along x and y of the turntable's frame.
+    rows = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns[..., :2]], axis=-1).reshape(-1, 6, 5)
+    mean = t.mean(axis=1)
+    solution = (np.linalg.pinv(rows, rcond=1e-12) @ (t - mean[:, None]).reshape(-1, 6, 1))[..., 0]
+    arm = np.concatenate([solution[:, 3:], np.zeros((len(solution), 1))], axis=1)
+    return Motions(R_w, solution[:, :3] + mean, nearest_rotation(R_m), arm)
+
+
+def _frames_about(axis: FloatArray) -> FloatArray:
+    """Rotations (M, 3, 3) whose third column is the unit axis (M, 3)."""
+    helper = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
+    u = unit(np.cross(helper, axis))
+    return np.stack([u, np.cross(axis, u), axis], axis=2)
 
 
 def wide_pairs(angles: FloatArray, most: int = PAIRS) -> list[tuple[int, int]]:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from lidarpose.refine.turntable import JointOptions
     from lidarpose.refine.turntable_joint import Start
     from lidarpose.solve.light_plane import StripePair
+    from lidarpose.solve.panel_pose import PanelPose
     from lidarpose.solve.paper import PaperSolution
 
 Step = Callable[[], None]
@@ -81,6 +82,14 @@ class DetectedFeatures:
     notes: tuple[str, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class FittedBefore:
+    """What the assignment has fitted: panels' poses by placement, light planes and stripes by position."""
+
+    panel_poses: Mapping[str, tuple[PanelPose, ...]]
+    stripe_pairs: Mapping[str, StripePair]
+
+
 def calibrate_turntable(
     session: TurntableSession,
     *,
@@ -117,7 +126,7 @@ def calibrate_turntable(
     """
     features = detect_features(session, step=step)
     try:
-        observations, stripe_pairs = assign_lines(session, features, first_panel=first_panel)
+        observations, fitted = assign_lines(session, features, first_panel=first_panel)
     except UndeterminedError as error:
         tried = _parts(session, features, first_panel)
         raise with_cause_named(error, session, features.places, features.left_out, *tried) from None
@@ -126,7 +135,7 @@ def calibrate_turntable(
     if method == "joint" and not any(place.stripes for place in observations.places):
         start = start_without_stripes(observations)
     else:
-        paper = solve(observations, stripe_pairs)
+        paper = solve(observations, fitted)
         start = start_of(paper)
         samples = {position: sample.pose for position, sample in paper.samples.items()}
     if method == "joint":
@@ -373,8 +382,8 @@ def _find_stripes(
 
 def assign_lines(
     session: TurntableSession, features: DetectedFeatures, *, first_panel: int | None = None
-) -> tuple[TurntableObservations, Mapping[str, StripePair]]:
-    """Decide by evidence which scan lines lie on which panels; with the stripes' fits that this took, by position."""
+) -> tuple[TurntableObservations, FittedBefore]:
+    """Decide by evidence which scan lines lie on which panels; with what was fitted for it."""
     from lidarpose.solve.assignment import assign
     from lidarpose.solve.paper import board_poses
 
@@ -383,14 +392,18 @@ def assign_lines(
     panel_poses = {name: board_poses(session.camera, corners[name], name) for name in corners}
     assignment = assign(session.camera, panel_poses, features.places, panels=session.panels, first_panel=first_panel)
     left_out = merge_left_out(features.left_out, assignment.left_out)
-    return replace(unassigned, places=assignment.places, left_out=left_out), assignment.stripe_pairs
+    return replace(unassigned, places=assignment.places, left_out=left_out), FittedBefore(
+        panel_poses, assignment.stripe_pairs
+    )
 
 
-def solve(observations: TurntableObservations, stripe_pairs: Mapping[str, StripePair] | None = None) -> PaperSolution:
-    """The paper's closed forms (its sections 1 and 2), with the stripes' fits that are there already."""
+def solve(observations: TurntableObservations, fitted: FittedBefore | None = None) -> PaperSolution:
+    """The paper's closed forms (its sections 1 and 2), with the fits that are there already."""
     from lidarpose.solve.paper import solve_paper
 
-    return solve_paper(observations, stripe_pairs=stripe_pairs)
+    if fitted is None:
+        return solve_paper(observations)
+    return solve_paper(observations, stripe_pairs=fitted.stripe_pairs, panel_poses=fitted.panel_poses)
 
 
 def start_of(paper: PaperSolution) -> Start:

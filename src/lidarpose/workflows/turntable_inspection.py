@@ -119,11 +119,11 @@ def inspect_turntable(
     try:
         features = detect_features(session, step=step)
         left_out = features.left_out
-        observations, stripe_pairs = assign_lines(session, features)
+        observations, fitted = assign_lines(session, features)
         left_out = observations.left_out
         used = len(observations.places)
         if any(place.stripes for place in observations.places):
-            paper = solve(observations, stripe_pairs)
+            paper = solve(observations, fitted)
             left_out = merge_left_out(left_out, paper.left_out)
             start = start_of(paper)
         else:
