@@ -93,7 +93,7 @@ def _candidate(surfaces: list[_Surface], triple: IntArray, corner: FloatArray) -
     local = [_on_its_side(p, k, faces, convex) for k, p in enumerate(local)]
     if min(len(p) for p in local) < MIN_FACE_POINTS:
         return None
-    outlines = [_outline(p, f.plane) for p, f in zip(local, faces, strict=True)]
+    outlines = [convex_outline(p, f.plane) for p, f in zip(local, faces, strict=True)]
     if any(len(o) < 3 for o in outlines):
         return None
     obstacles = _obstacles(surfaces, triple, local)
@@ -150,7 +150,7 @@ def _within_common_reach(points: FloatArray, local: list[FloatArray], corner: Fl
     return np.asarray(points[np.linalg.norm(points - corner, axis=1) <= 1.3 * reach])
 
 
-def _outline(points: FloatArray, plane: Plane) -> FloatArray:
+def convex_outline(points: FloatArray, plane: Plane) -> FloatArray:
     """The convex outline (K, 3) of points on a plane, counter-clockwise seen from the normal's side.
 
     Its vertices are the points farthest out in `OUTLINE_DIRECTIONS` directions.

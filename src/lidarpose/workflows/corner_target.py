@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
+from lidarpose.detect.edge_corner import find_edge_corners
 from lidarpose.detect.trihedral_corner import FaceMask, find_corners
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
@@ -60,6 +61,8 @@ class FoundTarget:
         Why the session's own coordinates do not fit, for the user; empty if they do.
     strays
         By place without a sighting: what stands there instead, for the user.
+    by_edges
+        The sightings are of two faces; the third's normal is but the direction of their edge.
     """
 
     sightings: tuple[CornerCandidate | None, ...]
@@ -68,6 +71,7 @@ class FoundTarget:
     oddity: str
     ambiguous: bool
     strays: Mapping[int, str] = field(default_factory=dict)
+    by_edges: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,8 +182,28 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
             candidates[k] += place_corners(place, seed + attempt, frame, FEWEST_FACE_RETURNS)
         matches, world, oddity = _match_with_mistakes(candidates, world_coordinates(session), session.estimate_scale)
     if not matches:
-        raise _not_found(session, candidates)
+        by_edges = _find_by_edges(session, seed)
+        if by_edges is None:
+            raise _not_found(session, candidates)
+        return by_edges
     return _found(session, candidates, matches, world, oddity)
+
+
+def _find_by_edges(session: CornerSession, seed: int) -> FoundTarget | None:
+    """The target by the edge of two of its faces, if one alone moves as the world coordinates say at all places but
+    one at most."""
+    world = world_coordinates(session)
+    candidates = [_edges_at(place, seed) for place in session.places]
+    matches = match_corners(candidates, world)
+    if not matches or matches[0].places < max(3, len(world) - 1):
+        return None
+    return replace(_found(session, candidates, matches, world, ""), by_edges=True)
+
+
+def _edges_at(place: CornerPlace, seed: int) -> tuple[CornerCandidate, ...]:
+    points = _near_hint(load_points(place.clouds[0]), place)
+    patches = segment_planes(points, PlaneSearch(min_points=FACE_RETURNS, from_sensor=True, seed=seed))
+    return find_edge_corners(points, patches)
 
 
 def _found(
@@ -224,12 +248,16 @@ def place_corners(
     place: CornerPlace, seed: int = 0, frame: int = 0, min_points: int = FACE_RETURNS
 ) -> tuple[CornerCandidate, ...]:
     """All corners in one frame of a place, or those near the hint, of faces with `min_points` returns or more."""
-    points = load_points(place.clouds[frame])
-    if place.near is not None:
-        offset = points - place.near.astype(points.dtype)
-        points = points[np.einsum("ij,ij->i", offset, offset) < HINT_CROP_M**2]
+    points = _near_hint(load_points(place.clouds[frame]), place)
     patches = segment_planes(points, PlaneSearch(min_points=min_points, from_sensor=True, seed=seed))
     return find_corners(points, patches, place.near, NEAR_RADIUS_M)
+
+
+def _near_hint(points: FloatArray, place: CornerPlace) -> FloatArray:
+    if place.near is None:
+        return points
+    offset = points - place.near.astype(points.dtype)
+    return np.asarray(points[np.einsum("ij,ij->i", offset, offset) < HINT_CROP_M**2])
 
 
 def _reordered(candidate: CornerCandidate, order: tuple[int, int, int]) -> CornerCandidate:

@@ -46,6 +46,7 @@ from lidarpose.workflows.corner_target import (
     gather,
     observe,
 )
+from lidarpose.workflows.thin_face import with_thin_face
 from lidarpose.workflows.world_evidence import corners_run, joint_run
 
 WorldMethod = Literal["joint", "paper", "paper-approx", "ransac", "harris"]
@@ -156,9 +157,11 @@ def world_run(
     session = replace(session, estimate_scale=scale_too)
     located = located or locate_target(session, seed=seed, tick=tick)
     found, crops = located.found, located.crops
+    if found.by_edges and method != "joint":
+        raise _two_faces()
     limits = PrecisionLimits(**(wishes or {}))
     if method == "joint":
-        run = _joint(session, found, crops, scale_too, limits)
+        run = _joint_with_all_faces(session, located, scale_too, limits)
     else:
         run = _cornerwise(session, found, crops, method, scale_too, limits, seed)
     recorded = {**(provenance or {}), **run.calibration.provenance}
@@ -171,17 +174,64 @@ def _usable_world(session: CornerSession, found: FoundTarget) -> CornerSession:
     return replace(session, places=places)
 
 
+def _joint_with_all_faces(
+    session: CornerSession, located: LocatedTarget, scale_too: bool, limits: PrecisionLimits
+) -> WorldRun:
+    """The joint estimate; again with the thin face from all places together where single places lack it."""
+    run, failure = None, None
+    try:
+        if located.found.by_edges:
+            raise _two_faces()
+        run = _joint(session, located.found, located.crops, scale_too, limits)
+    except UndeterminedError as error:
+        failure = error
+    if run is not None and (_rank(run) == 0 or _shows_all_faces(run, session)):
+        return run
+    mended = with_thin_face(located.found, located.crops)
+    if mended is not None:
+        try:
+            second = _joint(session, mended, gather(session, mended), scale_too, limits, own_fits=False)
+        except UndeterminedError:
+            second = None
+        if second is not None and (run is None or _rank(second) < _rank(run)):
+            return second
+    if run is None:
+        assert failure is not None
+        raise failure
+    return run
+
+
+def _two_faces() -> UndeterminedError:
+    return UndeterminedError(
+        "only two faces of the target are seen by more than a line at the places; the third is needed as well",
+        remedy="Bring the target nearer, or turn it so that several scan lines cross each face, or use joint.",
+    )
+
+
+def _rank(run: WorldRun) -> int:
+    quality = run.calibration.quality
+    return 2 if quality is None else ("good", "doubtful", "rejected").index(quality.verdict)
+
+
+def _shows_all_faces(run: WorldRun, session: CornerSession) -> bool:
+    """Whether three faces were seen at all places but a few."""
+    return sum(len(place.faces) == 3 for place in run.places) > 0.7 * len(session.places)
+
+
 def _joint(
     session: CornerSession,
     found: FoundTarget,
     crops: Sequence[PlaceCrop],
     scale_too: bool,
     limits: PrecisionLimits,
+    *,
+    own_fits: bool = True,
 ) -> WorldRun:
     mended = _usable_world(session, found)
     # First from a part of the returns, which tells where the faces are to a fraction of what all of them will.
     few = [crop.thinned(FIRST_RETURNS) for crop in crops]
-    fits = _place_fits(session, found, few)
+    # A face that single places do not determine leads their own fits astray.
+    fits = _place_fits(session, found, few) if own_fits else [None] * len(few)
     start, sigma_m = _start(mended, found, fits)
     corners = _corners(start, fits, found)
     places, _ = observe(mended, found, few, corners, start.normals, sigma_m)
@@ -235,8 +285,8 @@ def _turns(
     small = {used[k].position: turn for k, turn in own_turns(fit).items()}
     turns = {}
     for place, own in zip(session.places, fits, strict=True):
-        if own is not None:
-            turn = own.turn_statistic(fit.state.normals)
+        turn = small.get(place.position) if own is None else own.turn_statistic(fit.state.normals)
+        if turn is not None:
             turns[place.position] = turn if turn[0] > SMALL_TURN_RAD else small.get(place.position, turn)
     return turns
 
