@@ -56,6 +56,21 @@ def test_a_room_tells_the_mounting(name: str) -> None:
     assert len(estimate.surfaces) >= 6
 
 
+def test_a_rough_start_suffices_and_the_opposite_one_gives_the_mirror_image() -> None:
+    start, readings, beams = RIGS["half a fan, a full turn"]
+    truth = mounting((1.8, -1.3), (0.03, -0.02), start)
+    recording = sweep_room(truth, readings, beams, seed=1)
+    rough = calibrate_by_flatness(recording, axis_in_fan(np.radians(115.0))).estimate
+    axis, true_axis = rough.T_table_lidar.rotation[2], truth.rotation[2]
+    assert np.degrees(np.arccos(axis @ true_axis)) < 0.1
+    # Which way the table turns cannot be told: docs/methods-flatness.md.
+    mirrored = calibrate_by_flatness(recording, axis_in_fan(np.radians(-90.0))).estimate
+    axis = mirrored.T_table_lidar.rotation[2] * [1.0, 1.0, -1.0]
+    assert np.degrees(np.arccos(-axis @ true_axis)) < 0.1
+    angles = [np.stack([s.plane.normal for s in e.surfaces[:5]]) for e in (rough, mirrored)]
+    np.testing.assert_allclose(np.abs(angles[0] @ angles[0].T), np.abs(angles[1] @ angles[1].T), atol=5e-3)
+
+
 def test_a_floor_alone_is_refused() -> None:
     start, readings, beams = RIGS["half a fan, a full turn"]
     recording = sweep_room(start, readings, beams, surfaces=(flat(-1.1, (0.0, 0.0)), flat(1.6, (0.0, 0.0))))

@@ -21,6 +21,13 @@ _EXTRAS = {
 }
 
 
+MIRROR_NOTE = (
+    "Seen from where the axis points, the table is taken to turn anticlockwise as its readings grow. If yours turns "
+    "clockwise, all that is scanned comes out as in a mirror, just as flat: give the beam that points the other way "
+    "(--axis-beam-deg plus 180)."
+)
+
+
 def calibrate_recording(
     folder: Path,
     output: Path,
@@ -145,6 +152,7 @@ def summary(run: MountingRun) -> dict[str, Any]:
             for surface in estimate.surfaces
         ],
         "rounds": run.rounds,
+        "notes": [MIRROR_NOTE],
     }
 
 
@@ -170,4 +178,5 @@ def _print(console: Console, run: MountingRun, written: Path) -> None:
         state = "estimated" if extra.estimated else ("missing" if extra.suggested else "left alone")
         rows.append((extra.name, f"{factor * extra.value:.3f} {unit}", f"{factor * extra.sigma:.3f} {unit}", state))
     console.print(figures_table("Further parameters", ("value", "standard deviation", ""), rows))
+    console.print(MIRROR_NOTE, markup=False, soft_wrap=True)
     console.print(f"written: {written}", markup=False, soft_wrap=True)
