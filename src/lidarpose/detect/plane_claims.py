@@ -24,8 +24,10 @@ from lidarpose.model.plane_patch import PlanePatch
 
 Float32Array = NDArray[np.float32]
 
-# Points of a block: its coordinates, heights and masks stay in a core's cache.
-BLOCK = 1 << 15
+# Points of a block: its coordinates, heights and masks stay in a core's cache, and its matrix products are too small for
+# BLAS to share out among threads, which these blocks already keep busy.
+BLOCK = 32_000
+SLABS_AT_ONCE = 2
 GATE_SIGMAS = 3.0
 # Claimed is more than is kept in the end: what lies around a slab tells whether it is a surface.
 CLAIM_SIGMAS = 6.0
@@ -38,7 +40,7 @@ MOST_AT_GATE = 0.5
 LARGE_STEP = 20.0
 MOST_STEPS = 4
 FEWEST = 6
-SPREAD_POINTS = 20_000
+SPREAD_POINTS = 10_000
 # Of the terms 1, height, u, v.
 _ON_PLANE = [0, 2, 3]
 
@@ -82,14 +84,15 @@ class Slab:
         return Slab(plane, sigma_m, raster, allowed.ravel(), rows)
 
     def holds(self, cells: Float32Array) -> BoolArray:
-        """Which of points lie in allowed cells, by their coordinates (2, M) in cells, which are lost."""
-        high = np.array(self.raster.shape, dtype=np.float32)[:, None] - np.float32(1.0)
+        """Which of points lie in allowed cells, by their coordinates (2, M) in cells, of which the second is lost."""
+        u, v = cells
         # What lies outside ends on the border, which is never allowed.
-        np.maximum(cells, np.float32(0.0), out=cells)
-        u, v = np.minimum(cells, high, out=cells).astype(np.int32)
-        u *= np.int32(self.raster.shape[1])
-        u += v
-        return np.asarray(self.allowed.take(u))
+        np.maximum(v, np.float32(0.0), out=v)
+        np.minimum(v, np.float32(self.raster.shape[1] - 1), out=v)
+        cell = u.astype(np.int32)
+        cell *= np.int32(self.raster.shape[1])
+        cell += v.astype(np.int32)
+        return np.asarray(self.allowed.take(cell, mode="clip"))
 
     def leant(self, lean: FloatArray) -> Plane:
         """The plane that has the heights lean . (1, u, v) over this one."""
@@ -100,19 +103,25 @@ class Slab:
 
 @dataclass(frozen=True, eq=False)
 class _Claims:
-    """Points of a block near one patch: which (M,), their terms (1, height, u, v) (4, M), and which lie in a seam."""
+    """Points of a block near one patch: which (M,), their terms (1, height, u, v) (4, M), which lie in the patch's cells,
+    and the positions among them of those that another patch claims too."""
 
     indices: IntArray
     terms: Float32Array
-    alone: BoolArray
+    held: BoolArray
+    disputed: IntArray
 
     def moments(self, rest: Float32Array, sigma_m: float) -> tuple[FloatArray, FloatArray]:
         """Sums (4, 4) of the terms' products within the gate, and (3, 3) of (1, u, v) around it, by heights (M,)."""
         apart = np.abs(rest)
-        inside = (apart < np.float32(GATE_SIGMAS * sigma_m)) & self.alone
+        apart[self.disputed] = np.inf
         low, high = (np.float32(s * sigma_m) for s in RIM_SIGMAS)
-        rim = self.terms.take(np.flatnonzero((apart > low) & (apart < high) & self.alone), axis=1)[_ON_PLANE]
-        return (self.terms * inside) @ self.terms.T, rim @ rim.T
+        off = np.flatnonzero(apart > low)
+        off = off[(apart.take(off) < high) & self.held.take(off)]
+        rim = self.terms.take(off, axis=1)[_ON_PLANE]
+        inside = apart < np.float32(GATE_SIGMAS * sigma_m)
+        inside &= self.held
+        return (self.terms * inside.astype(np.float32)) @ self.terms.T, rim @ rim.T
 
 
 _Part = tuple[_Claims, FloatArray, FloatArray]
@@ -167,50 +176,55 @@ def patches_of_slabs(
     workers = min(os.cpu_count() or 1, len(blocks))
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda block: _claim(x, free, slabs, block), blocks))
-    taken = np.zeros(len(x), dtype=bool)
+        of_slabs = [[part[k] for part in parts] for k in range(len(slabs))]
+        fits = list(pool.map(lambda slab, mine: _fit(slab, mine, widest_m), slabs, of_slabs))
+        members = list(pool.map(lambda block, part: _members(block, part, fits), blocks, parts))
     patches: list[Claim | None] = []
-    for k, slab in enumerate(slabs):
-        fit = _fit(slab, [part[k] for part in parts], widest_m)
+    for k, fit in enumerate(fits):
         if fit is None:
             patches.append(None)
             continue
-        indices = np.concatenate([_members(part[k][0], fit) for part in parts])
-        if patches:
-            indices = indices[~taken[indices]]
-        taken[indices] = True
-        around = np.concatenate([part[k][0].indices for part in parts])
-        around = around[:: len(around) // EVIDENCE_POINTS + 1]
-        patches.append(Claim(PlanePatch(slab.leant(fit.lean), indices, fit.sigma_m), fit.variances, around))
+        patch = PlanePatch(slabs[k].leant(fit.lean), np.concatenate([m[k] for m in members]), fit.sigma_m)
+        every = sum(len(claims.indices) for claims, _, _ in of_slabs[k]) // EVIDENCE_POINTS + 1
+        around = [claims.indices[::every][claims.held[::every]] for claims, _, _ in of_slabs[k]]
+        patches.append(Claim(patch, fit.variances, np.concatenate(around)))
     return patches
 
 
 def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab], block: slice) -> list[_Part]:
     """What each slab claims of a block of the points."""
-    points = np.ones((4, block.stop - block.start), dtype=np.float32)
+    points = np.empty((4, block.stop - block.start), dtype=np.float32)
     np.copyto(points[:3], x[block].T, casting="same_kind")
-    height = np.array([s.rows[1] for s in slabs], dtype=np.float32) @ points
-    near = np.abs(height, out=height) < np.array([[CLAIM_SIGMAS * s.sigma_m] for s in slabs], dtype=np.float32)
+    points[3] = 1.0
+    rows = np.array([s.rows[1] / (CLAIM_SIGMAS * s.sigma_m) for s in slabs], dtype=np.float32)
+    height = np.empty((len(slabs), points.shape[1]), dtype=np.float32)
+    for first in range(0, len(slabs), SLABS_AT_ONCE):
+        some = slice(first, first + SLABS_AT_ONCE)
+        np.matmul(rows[some], points, out=height[some])
+    near = np.abs(height, out=height) < np.float32(1.0)
     if free is not None:
         near &= free[block]
+    # Slabs are endless, so that many points lie in two of them; claimed twice are those that both patches hold.
+    suspects = np.add.reduce(near, axis=0, dtype=np.uint8) > 1
+    times = np.zeros(len(suspects), dtype=np.uint8)
     found = []
     for slab, mine in zip(slabs, near, strict=True):
         indices = np.flatnonzero(mine)
         terms = slab.rows.astype(np.float32) @ points.take(indices, axis=1)
         held = slab.holds(terms[4:])
-        if held.all():
-            found.append((indices, terms[:4]))
-        else:
-            found.append((indices[held], terms[:4].compress(held, axis=1)))
-    # Slabs are endless, so that many points lie in two of them; claimed twice are those that both patches hold.
-    suspects = np.add.reduce(near, axis=0, dtype=np.uint8) > 1
-    claims = np.zeros(len(suspects), dtype=np.uint8)
-    for indices, _ in found:
-        claims[indices[suspects.take(indices)]] += 1
-    out = []
-    for slab, (indices, terms) in zip(slabs, found, strict=True):
-        mine = _Claims(indices + block.start, terms, claims.take(indices) < 2)
-        out.append((mine, *mine.moments(terms[1], slab.sigma_m)))
-    return out
+        terms = terms[:4]
+        if np.count_nonzero(held) < 0.5 * len(held):
+            indices, terms = indices[held], terms.compress(held, axis=1)
+            held = np.ones(len(indices), dtype=bool)
+        doubtful = np.flatnonzero(suspects.take(indices))
+        doubtful = doubtful[held[doubtful]]
+        times[indices[doubtful]] += 1
+        found.append((indices, terms, held, doubtful))
+    parts = []
+    for slab, (indices, terms, held, doubtful) in zip(slabs, found, strict=True):
+        claims = _Claims(indices + block.start, terms, held, doubtful[times[indices[doubtful]] > 1])
+        parts.append((claims, *claims.moments(terms[1], slab.sigma_m)))
+    return parts
 
 
 def _fit(slab: Slab, parts: Sequence[_Part], widest_m: float) -> _Fit | None:
@@ -236,7 +250,7 @@ def _fit(slab: Slab, parts: Sequence[_Part], widest_m: float) -> _Fit | None:
             break
         sums = [claim.moments(_rest(claim.terms, lean), slab.sigma_m) for claim in claims]
     every = int(count) // SPREAD_POINTS + 1
-    rest = np.concatenate([_rest(claim.terms[:, ::every], lean) for claim in claims])
+    rest = np.concatenate([_rest(claim.terms[:, ::every], lean)[claim.held[::every]] for claim in claims])
     rest = rest[np.abs(rest) < GATE_SIGMAS * slab.sigma_m]
     sigma_m = min(max(mad_sigma(rest, centred=True), 0.5 * slab.sigma_m), widest_m)
     return _Fit(lean, sigma_m, variances)
@@ -259,6 +273,18 @@ def _rest(terms: Float32Array, lean: FloatArray) -> Float32Array:
     return np.array([-lean[0], 1.0, -lean[1], -lean[2]], dtype=np.float32) @ terms
 
 
-def _members(claims: _Claims, fit: _Fit) -> IntArray:
-    """Indices of the points within three sigmas of the plane."""
-    return claims.indices[np.abs(_rest(claims.terms, fit.lean)) < np.float32(GATE_SIGMAS * fit.sigma_m)]
+def _members(block: slice, parts: Sequence[_Part], fits: Sequence[_Fit | None]) -> list[IntArray]:
+    """Indices of the points of a block within three sigmas of each plane; in seams the first plane takes them."""
+    taken = np.zeros(block.stop - block.start, dtype=bool)
+    members = []
+    for (claims, _, _), fit in zip(parts, fits, strict=True):
+        if fit is None:
+            members.append(np.zeros(0, dtype=np.int64))
+            continue
+        mine = (np.abs(_rest(claims.terms, fit.lean)) < np.float32(GATE_SIGMAS * fit.sigma_m)) & claims.held
+        disputed = claims.disputed[mine[claims.disputed]]
+        places = claims.indices[disputed] - block.start
+        mine[disputed] = ~taken[places]
+        taken[places] = True
+        members.append(claims.indices[mine])
+    return members
