@@ -10,13 +10,13 @@ faces come up once the large ones are gone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarpose.detect.plane_claims import Slab, patches_of_slabs
-from lidarpose.detect.plane_raster import cell_size_m, grown, raster_of
+from lidarpose.detect.plane_raster import cell_size_m, grown, mean_and_covariance, raster_of
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
 from lidarpose.geometry.robust import mad_sigma
@@ -25,16 +25,23 @@ from lidarpose.model.plane_patch import PlanePatch
 Float32Array = NDArray[np.float32]
 
 SAMPLE_SIZE = 4096
+PLANES_AT_ONCE = 32
 # From this many points on, patches are found and tested in a subsample, and the whole cloud is asked once.
-DENSE = 100_000
-DENSE_SAMPLE = 16_384
+DENSE = 200_000
+DENSE_SAMPLE = 8192
+DENSE_HYPOTHESES = 400
 FEWEST_OF_SAMPLE = 30
-ENOUGH_EVIDENCE = 2000
+# So many voxels of the subsample tell whether a patch is a surface, and so many hypotheses' neighbourhoods.
+ENOUGH_EVIDENCE = 1000
+ENOUGH_SEEDS = 12
 HYPOTHESES = 1000
 # Neighbourhoods of a hypothesis, in nearest points of the subsample and of a quarter of it: wide ones reach
 # across the gaps between the lines of a multi-beam LiDAR, narrow ones fit on small faces.
 NEIGHBOURHOODS = (10, 20)
 THINNED = 4
+# Of the hypotheses with most votes, how many are compared by their largest connected patch.
+RIVALS = 4
+DENSE_RIVALS = 2
 POINTS_PER_HYPOTHESIS = 10
 GATE_SIGMAS = 3.0
 MIN_SIGMA_M = 2e-4
@@ -82,13 +89,32 @@ class PlaneSearch:
 
 @dataclass(eq=False)
 class _Sample:
-    """A subsample with its hypotheses: planes (H, 4) as normal and offset, and who is near which, (H, S) as 0 or 1."""
+    """A subsample with its hypotheses: planes (H, 4) as normal and offset, and who is near which, (H, S) as 0 or 1.
+
+    For a dense cloud also what the neighbourhoods of all hypotheses say of the surfaces that they lie on.
+    """
 
     indices: IntArray
     points: Float32Array
     planes: FloatArray
     near: Float32Array
     sigma_m: float
+    seeds: _Seeds | None = None
+    rivals: int = RIVALS
+
+
+@dataclass(frozen=True, eq=False)
+class _Seeds:
+    """Points (H, 3) and the normals (H, 3) that their neighbours give, where they give one."""
+
+    points: Float32Array
+    normals: FloatArray
+
+    def agree(self, on_patch: BoolArray, normal: FloatArray) -> bool | None:
+        """Whether the normals on a patch are mostly its own; None where too few know."""
+        if np.count_nonzero(on_patch) < ENOUGH_SEEDS:
+            return None
+        return _mostly_agree(self.normals[on_patch], normal)
 
 
 def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = None) -> tuple[PlanePatch, ...]:
@@ -122,6 +148,7 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
         else:
             x = np.ascontiguousarray(x, dtype=np.float32)
             sample = _draw(x, np.flatnonzero(free), sigma_m, search, rng)
+            sample.seeds = None
             found = _harvest(x, free, sample, least, at_most)
         if not found:
             break
@@ -148,7 +175,9 @@ def _harvest_dense(
     few = x[chosen].astype(np.float32)
     share = count / len(few)
     fewest = max(int(least / share), FEWEST_OF_SAMPLE)
-    sample = _draw(few, _one_of_each(len(few), SAMPLE_SIZE, rng), sigma_m, search, rng)
+    jury = _one_of_each(len(few), SAMPLE_SIZE, rng)
+    sample = _draw(few, jury, sigma_m, replace(search, hypotheses=min(search.hypotheses, DENSE_HYPOTHESES)), rng)
+    sample.rivals = DENSE_RIVALS
     seen = _harvest(few, np.ones(len(few), dtype=bool), sample, fewest, at_most)
     slabs = [Slab.around(few[p.indices], p.plane, p.sigma_m) for p in seen]
     if not slabs:
@@ -190,41 +219,67 @@ def _draw(
     points = x[indices]
     count = min(search.hypotheses, 4 * len(points))
     thinned = points[rng.random(len(points)) < 1.0 / THINNED]
-    chosen = _neighbourhoods(points, count // 2, rng)
+    seeds, chosen = _neighbourhoods(points, count // 2, rng)
     if len(thinned) >= POINTS_PER_HYPOTHESIS:
-        chosen = np.concatenate([chosen, _neighbourhoods(thinned, count // 2, rng)])
-    planes, thickness, flat = _local_planes(chosen)
+        more_seeds, more = _neighbourhoods(thinned, count // 2, rng)
+        seeds, chosen = np.concatenate([seeds, more_seeds]), np.concatenate([chosen, more])
+    planes, variances = _local_planes(chosen)
+    flat = variances[:, 1] > 0.01 * variances[:, 2]
     if search.from_sensor:
         flat &= np.abs(planes[:, 3]) > EDGE_ON * np.linalg.norm(chosen.mean(axis=1), axis=1)
+    thickness = np.sqrt(variances[:, 0] * POINTS_PER_HYPOTHESIS / (POINTS_PER_HYPOTHESIS - 3.0))
     if sigma_m is None:
         sigma_m = _noise_from_neighbourhoods(thickness[flat])
-    planes = planes[flat & (thickness < 4.0 * sigma_m)]
-    distance = points @ planes[:, :3].astype(np.float32).T - planes[:, 3].astype(np.float32)
-    near = (np.abs(distance) < np.float32(GATE_SIGMAS * sigma_m)).astype(np.float32)
-    return _Sample(indices, points, planes, near, sigma_m)
+    known = _has_normal(variances, sigma_m)
+    thin = flat & (thickness < 4.0 * sigma_m)
+    near = _near(points, planes[thin], GATE_SIGMAS * sigma_m)
+    return _Sample(indices, points, planes[thin], near, sigma_m, _Seeds(seeds[known], planes[known, :3]))
 
 
-def _neighbourhoods(points: Float32Array, count: int, rng: np.random.Generator) -> Float32Array:
-    """Points (count, K, 3) drawn from the nearest ones of random points, by turns from more and from fewer of them."""
+def _near(points: Float32Array, planes: FloatArray, gate_m: float) -> Float32Array:
+    """Which points (S, 3) lie how near to which planes (H, 4): 1 within the gate, else 0, (H, S)."""
+    near = np.empty((len(planes), len(points)), dtype=np.float32)
+    rows, columns = planes.astype(np.float32), np.ascontiguousarray(points.T)
+    for first in range(0, len(planes), PLANES_AT_ONCE):
+        some = rows[first : first + PLANES_AT_ONCE]
+        distance = some[:, :3] @ columns
+        distance -= some[:, 3:]
+        np.abs(distance, out=distance)
+        near[first : first + PLANES_AT_ONCE] = distance < np.float32(gate_m)
+    return near
+
+
+def _neighbourhoods(points: Float32Array, count: int, rng: np.random.Generator) -> tuple[Float32Array, Float32Array]:
+    """Random points (count, 3), and (count, K, 3) drawn from their nearest ones, by turns from more and from fewer."""
     from scipy.spatial import cKDTree
 
     seeds = rng.integers(0, len(points), count)
     widest = min(NEIGHBOURHOODS[-1], len(points))
-    _, neighbours = cKDTree(points).query(points[seeds], k=widest)
+    tree = cKDTree(points, compact_nodes=False, balanced_tree=False)
+    _, neighbours = tree.query(points[seeds], k=widest)
     reach = np.minimum(np.array(NEIGHBOURHOODS)[np.arange(count) % len(NEIGHBOURHOODS)], widest)
     picks = (rng.random((count, POINTS_PER_HYPOTHESIS)) * reach[:, None]).astype(np.int64)
-    return np.asarray(points[np.take_along_axis(neighbours, picks, axis=1)])
+    return points[seeds], np.asarray(points[np.take_along_axis(neighbours, picks, axis=1)])
 
 
-def _local_planes(chosen: Float32Array) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Planes (H, 4) through neighbourhoods (H, K, 3), their thickness (H,), and whether they have two extents."""
+def _local_planes(chosen: Float32Array) -> tuple[FloatArray, FloatArray]:
+    """Planes (H, 4) through neighbourhoods (H, K, 3), and the variances (H, 3) of their points, ascending."""
     mean = chosen.mean(axis=1, dtype=np.float64)
     d = chosen - mean[:, None, :]
-    values, vectors = np.linalg.eigh(np.einsum("hki,hkj->hij", d, d, optimize=False) / chosen.shape[1])
+    values, vectors = np.linalg.eigh(d.swapaxes(1, 2) @ d / chosen.shape[1])
     normals = vectors[:, :, 0]
     planes = np.column_stack([normals, np.einsum("hi,hi->h", normals, mean)])
-    thickness = np.sqrt(np.maximum(values[:, 0], 0.0) * chosen.shape[1] / (chosen.shape[1] - 3.0))
-    return planes, thickness, values[:, 1] > 0.01 * values[:, 2]
+    return planes, np.maximum(values, 0.0)
+
+
+def _has_normal(variances: FloatArray, sigma_m: float) -> BoolArray:
+    """Of neighbourhoods with variances (H, 3), which have a normal: wider than the noise, and not along a line."""
+    return (variances[:, 1] > (SCREENING_WIDTH * sigma_m) ** 2) & (variances[:, 1] > LINED_UP * variances[:, 2])
+
+
+def _mostly_agree(normals: FloatArray, normal: FloatArray) -> bool:
+    agree = np.abs(normals @ normal) > np.cos(SCREENING_RAD)
+    return bool(np.count_nonzero(agree) >= SCREENED_SHARE * len(agree))
 
 
 def _noise_from_neighbourhoods(thickness: FloatArray) -> float:
@@ -243,19 +298,19 @@ def _harvest(x: Float32Array, free: BoolArray, sample: _Sample, least: int, at_m
     least_sample = max(least / scale, 12.0)
     dead = np.zeros(len(sample.planes), dtype=bool)
     while len(patches) < at_most and not dead.all():
-        votes = active @ sample.near
+        votes = sample.near @ active
         votes[dead] = -1.0
         if votes.max() < least_sample:
             break
         candidate, component, hypothesis = _best_patch(sample, active, votes)
         if component.sum() < least_sample:
-            dead |= sample.near[component].sum(axis=0) > 0.5 * np.maximum(component.sum(), 1)
+            dead |= sample.near @ component > 0.5 * np.maximum(component.sum(), 1)
             dead[hypothesis] = True
             continue
         patch = _refit(x, free, candidate, sample, component)
         if patch is None or len(patch) < least:
             dead[hypothesis] = True
-            dead |= sample.near[component].sum(axis=0) > 0.8 * component.sum()
+            dead |= sample.near @ component > 0.8 * component.sum()
             # What looked most like a plane here and is none would look so from many sides: no more votes from it.
             active[component] = 0.0
             continue
@@ -267,12 +322,12 @@ def _harvest(x: Float32Array, free: BoolArray, sample: _Sample, least: int, at_m
 
 def _best_patch(sample: _Sample, active: Float32Array, votes: Float32Array) -> tuple[Plane, BoolArray, int]:
     """Of the hypotheses with most votes the one whose largest connected patch is largest, optimised locally."""
-    leaders = np.argsort(-votes)[:24:6]
+    leaders = np.argsort(-votes)[: 6 * sample.rivals : 6]
     best: tuple[int, Plane, BoolArray, int] | None = None
     for leader in leaders:
         if best is not None and votes[leader] <= best[0]:
             break
-        inside = (sample.near[:, leader] > 0.5) & (active > 0.5)
+        inside = (sample.near[leader] > 0.5) & (active > 0.5)
         plane = Plane(sample.planes[leader, :3], sample.planes[leader, 3])
         component = _largest_component(sample.points, inside, plane)
         if best is None or component.sum() > best[0]:
@@ -308,8 +363,7 @@ def _largest_component(points: Float32Array, inside: BoolArray, plane: Plane) ->
         return result
     chosen = points[members]
     # A thinned subsample has gaps of its own: twice the spacing that its own number and extent give.
-    raster = raster_of(chosen, plane, cell_size_m(chosen), 0)
-    cells = raster.cells(chosen)
+    raster, cells = raster_of(chosen, plane, cell_size_m(chosen), 0)
     occupied = np.bincount(cells[cells >= 0], minlength=raster.shape[0] * raster.shape[1]).reshape(raster.shape)
     labels, pieces = ndimage.label(occupied > 0, structure=np.ones((3, 3)))
     if pieces > 1:
@@ -324,9 +378,9 @@ def _largest_component(points: Float32Array, inside: BoolArray, plane: Plane) ->
 def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, component: BoolArray) -> PlanePatch | None:
     """The patch on the full cloud: free points near the plane in the cells that the component occupies."""
     seen = sample.points[component]
-    raster = raster_of(seen, plane, cell_size_m(seen), 1)
+    raster, cells = raster_of(seen, plane, cell_size_m(seen), 1)
     occupied = np.zeros(raster.shape[0] * raster.shape[1] + 1, dtype=bool)
-    occupied[raster.cells(seen)] = True
+    occupied[cells] = True
     allowed = np.append(grown(occupied[:-1].reshape(raster.shape)).ravel(), False)
     # Twice the widest slab: what lies just outside it tells a plane from something else.
     reach = np.float32(2.0 * WIDEST * GATE_SIGMAS * sample.sigma_m)
@@ -347,19 +401,27 @@ def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, comp
             return None
         normal, offset, variances = _moments(local, inside)
         sigma_m = _spread(distance[inside], sample.sigma_m)
-    if not _is_thin(variances, sigma_m) or not _stands_out(local, normal, offset, sigma_m):
+    agree = None
+    if sample.seeds is not None:
+        seeds = sample.seeds.points
+        on_patch = np.abs((seeds - centre) @ normal - offset) < GATE_SIGMAS * sigma_m
+        agree = sample.seeds.agree(on_patch & allowed[raster.cells(seeds)], normal)
+    if not _is_thin(variances, sigma_m) or not _stands_out(local, normal, offset, sigma_m, agree):
         return None
     offset += float(normal @ centre)
     final = Plane(normal, offset) if offset <= 0.0 else Plane(-normal, -offset)
     return PlanePatch(final, near[inside], sigma_m)
 
 
-def _stands_out(local: Float32Array, normal: FloatArray, offset: float, sigma_m: float) -> bool:
+def _stands_out(
+    local: Float32Array, normal: FloatArray, offset: float, sigma_m: float, neighbours_agree: bool | None = None
+) -> bool:
     """Whether a plane is more than a slab through something else: a scanner's mount, clutter, a dense blob.
 
     Of the points (M, 3) around it, the slab has to hold most of what lies up to twice as far off, and to be thin
     beside both its extents. One point a voxel counts: where beams crowd, as at the pole of a turntable, they are no
-    more evidence than elsewhere, and whatever lies there would look flat.
+    more evidence than elsewhere, and whatever lies there would look flat. Whether neighbours agree with the plane is
+    found out here if it is not known.
     """
     points = local[:: max(len(local) // EVIDENCE_POINTS, 1)]
     points = points[_one_a_voxel(points, GATE_SIGMAS * sigma_m)]
@@ -368,8 +430,10 @@ def _stands_out(local: Float32Array, normal: FloatArray, offset: float, sigma_m:
     around = height < 2.0 * GATE_SIGMAS * sigma_m
     if np.count_nonzero(inside) < max(STANDS_OUT * np.count_nonzero(around), 4.0):
         return False
-    variances = np.linalg.eigvalsh(np.cov(points[inside].T.astype(np.float64)))
-    return bool(variances[0] < THIN**2 * variances[1]) and _neighbours_agree(points[around], normal, sigma_m)
+    variances = np.linalg.eigvalsh(mean_and_covariance(points[inside])[1])
+    if not variances[0] < THIN**2 * variances[1]:
+        return False
+    return _neighbours_agree(points[around], normal, sigma_m) if neighbours_agree is None else neighbours_agree
 
 
 def _neighbours_agree(points: Float32Array, normal: FloatArray, sigma_m: float) -> bool:
@@ -384,21 +448,31 @@ def _neighbours_agree(points: Float32Array, normal: FloatArray, sigma_m: float) 
     _, neighbours = cKDTree(points, compact_nodes=False, balanced_tree=False).query(seeds, k=SCREENING_NEIGHBOURS)
     around = points[neighbours].astype(np.float64)
     d = around - around.mean(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", d, d, optimize=False) / SCREENING_NEIGHBOURS)
-    known = (values[:, 1] > (SCREENING_WIDTH * sigma_m) ** 2) & (values[:, 1] > LINED_UP * values[:, 2])
+    values, vectors = np.linalg.eigh(d.swapaxes(1, 2) @ d / SCREENING_NEIGHBOURS)
+    known = _has_normal(values, sigma_m)
     if np.count_nonzero(known) < ASKED_SHARE * len(known):
         return True
-    agree = np.abs(vectors[known, :, 0] @ normal) > np.cos(SCREENING_RAD)
-    return bool(np.count_nonzero(agree) >= SCREENED_SHARE * len(agree))
+    return _mostly_agree(vectors[known, :, 0], normal)
 
 
 def _one_a_voxel(points: Float32Array, side_m: float) -> IntArray:
     """The first point (V,) in each cube of the side that holds any of points (M, 3)."""
-    cells = np.floor(points / np.float32(side_m)).astype(np.int64)
-    cells -= cells.min(axis=0)
-    extent = cells.max(axis=0) + 1
-    flat = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
-    return np.asarray(np.unique(flat, return_index=True)[1], dtype=np.int64)
+    x, y, z = np.floor(points.T / np.float32(side_m)).astype(np.int64)
+    y -= y.min()
+    z -= z.min()
+    cells = (x - x.min()) * (int(y.max()) + 1)
+    cells += y
+    cells *= int(z.max()) + 1
+    cells += z
+    # Cell and number of a point in one word, where they fit: sorting words is five times as quick as sorting numbers
+    # by cells.
+    bits = len(points).bit_length()
+    if int(cells.max()) >> (63 - bits):
+        return np.asarray(np.unique(cells, return_index=True)[1], dtype=np.int64)
+    words = np.sort((cells << bits) | np.arange(len(points)))
+    cells = words >> bits
+    first = np.append(True, cells[1:] != cells[:-1])
+    return np.asarray(words[first] & ((1 << bits) - 1), dtype=np.int64)
 
 
 def _moments(local: Float32Array, inside: BoolArray) -> tuple[FloatArray, float, FloatArray]:

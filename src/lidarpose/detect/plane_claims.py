@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,21 +24,27 @@ from lidarpose.model.plane_patch import PlanePatch
 
 Float32Array = NDArray[np.float32]
 
-# Points of a block: its coordinates, heights and masks stay in a core's cache, and its matrix products are too small for
-# BLAS to share out among threads, which these blocks already keep busy.
+# Points of a block: its coordinates, heights and masks stay in a core's cache, and its matrix products are too small
+# for BLAS to share out among threads, which these blocks already keep busy.
 BLOCK = 32_000
 SLABS_AT_ONCE = 2
 GATE_SIGMAS = 3.0
 # Claimed is more than is kept in the end: what lies around a slab tells whether it is a surface.
 CLAIM_SIGMAS = 6.0
 EVIDENCE_POINTS = 8000
+# A patch is screened cell by cell where this share of its claims lies outside the gate; a clean one has 0.3 %.
+CLUTTERED = 0.02
+# A cell of a surface has at least this share of its claims within the gate.
+STANDS_OUT = 0.7
 # Heights around the gate, one sigma wide, that tell what enters and leaves as the plane moves.
 RIM_SIGMAS = (2.5, 3.5)
 # At most this share of the points' information may be at the gate; else it is no gate.
 MOST_AT_GATE = 0.5
-# A step of more than this many standard deviations of the result is followed by another.
+# A step of more than this many standard deviations of the result is followed by another; sooner where it costs little.
 LARGE_STEP = 20.0
-MOST_STEPS = 4
+SMALL_STEP = 0.5
+FEW_POINTS = 50_000
+MOST_STEPS = 5
 FEWEST = 6
 SPREAD_POINTS = 10_000
 # Of the terms 1, height, u, v.
@@ -69,9 +75,8 @@ class Slab:
     @staticmethod
     def around(points: NDArray[np.floating], plane: Plane, sigma_m: float) -> Slab:
         """The slab of a patch with points (M, 3)."""
-        raster = raster_of(points, plane, spacing_m(points), 2)
+        raster, cells = raster_of(points, plane, spacing_m(points), 2)
         occupied = np.zeros(raster.shape[0] * raster.shape[1], dtype=bool)
-        cells = raster.cells(points)
         occupied[cells[cells >= 0]] = True
         allowed = grown(occupied.reshape(raster.shape))
         allowed[[0, -1]] = allowed[:, [0, -1]] = False
@@ -83,16 +88,25 @@ class Slab:
         rows[4:, :3], rows[4:, 3] = raster.axes / raster.cell_m, -raster.origin
         return Slab(plane, sigma_m, raster, allowed.ravel(), rows)
 
-    def holds(self, cells: Float32Array) -> BoolArray:
+    def holds(self, across: Float32Array) -> BoolArray:
         """Which of points lie in allowed cells, by their coordinates (2, M) in cells, of which the second is lost."""
-        u, v = cells
-        # What lies outside ends on the border, which is never allowed.
+        return np.asarray(self.allowed.take(self._numbers(across), mode="clip"))
+
+    def cells(self, terms: Float32Array) -> NDArray[np.int32]:
+        """Numbers (M,) of the cells of points on the raster by their terms (1, height, u, v) (4, M)."""
+        across = terms[2:] / np.float32(self.raster.cell_m)
+        across += (self.rows[4:, 3] - self.rows[2:4, 3] / self.raster.cell_m).astype(np.float32)[:, None]
+        return np.asarray(np.clip(self._numbers(across), 0, len(self.allowed) - 1))
+
+    def _numbers(self, across: Float32Array) -> NDArray[np.int32]:
+        u, v = across
+        # What lies outside ends on the border, which is never allowed, or beyond the first or last cell.
         np.maximum(v, np.float32(0.0), out=v)
         np.minimum(v, np.float32(self.raster.shape[1] - 1), out=v)
-        cell = u.astype(np.int32)
-        cell *= np.int32(self.raster.shape[1])
-        cell += v.astype(np.int32)
-        return np.asarray(self.allowed.take(cell, mode="clip"))
+        numbers: NDArray[np.int32] = u.astype(np.int32)
+        numbers *= np.int32(self.raster.shape[1])
+        numbers += v.astype(np.int32)
+        return numbers
 
     def leant(self, lean: FloatArray) -> Plane:
         """The plane that has the heights lean . (1, u, v) over this one."""
@@ -103,8 +117,8 @@ class Slab:
 
 @dataclass(frozen=True, eq=False)
 class _Claims:
-    """Points of a block near one patch: which (M,), their terms (1, height, u, v) (4, M), which lie in the patch's cells,
-    and the positions among them of those that another patch claims too."""
+    """Points of a block near one patch: which (M,), their terms (1, height, u, v) (4, M), which lie in the patch's
+    cells, and the positions among them of those that another patch claims too."""
 
     indices: IntArray
     terms: Float32Array
@@ -176,9 +190,9 @@ def patches_of_slabs(
     workers = min(os.cpu_count() or 1, len(blocks))
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda block: _claim(x, free, slabs, block), blocks))
-        of_slabs = [[part[k] for part in parts] for k in range(len(slabs))]
+        of_slabs = list(pool.map(_screened, slabs, ([part[k] for part in parts] for k in range(len(slabs)))))
         fits = list(pool.map(lambda slab, mine: _fit(slab, mine, widest_m), slabs, of_slabs))
-        members = list(pool.map(lambda block, part: _members(block, part, fits), blocks, parts))
+        members = list(pool.map(lambda block, part: _members(block, part, fits), blocks, zip(*of_slabs, strict=True)))
     patches: list[Claim | None] = []
     for k, fit in enumerate(fits):
         if fit is None:
@@ -227,6 +241,27 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
     return parts
 
 
+def _screened(slab: Slab, parts: Sequence[_Part]) -> Sequence[_Part]:
+    """The claims without those in cells that hold hardly more than what lies around the slab there, where a chain of
+    stray points led the subsample astray: few points, but far out. In clean surroundings nothing is asked."""
+    within = sum(float(moments[0, 0]) for _, moments, _ in parts)
+    held = sum(np.count_nonzero(claims.held) - len(claims.disputed) for claims, _, _ in parts)
+    if held - within < CLUTTERED * held:
+        return parts
+    cells = [slab.cells(claims.terms) for claims, _, _ in parts]
+    inside, around = (np.zeros(len(slab.allowed)) for _ in range(2))
+    for (claims, _, _), cell in zip(parts, cells, strict=True):
+        near = np.abs(claims.terms[1]) < np.float32(GATE_SIGMAS * slab.sigma_m)
+        inside += np.bincount(cell[claims.held & near], minlength=len(inside))
+        around += np.bincount(cell[claims.held & ~near], minlength=len(inside))
+    solid = inside > STANDS_OUT * (inside + around)
+    out = []
+    for (claims, _, _), cell in zip(parts, cells, strict=True):
+        kept = replace(claims, held=claims.held & solid[cell])
+        out.append((kept, *kept.moments(claims.terms[1], slab.sigma_m)))
+    return out
+
+
 def _fit(slab: Slab, parts: Sequence[_Part], widest_m: float) -> _Fit | None:
     """Least squares of the heights within three sigmas of the plane itself, by Newton's method from the subsample's.
 
@@ -246,7 +281,8 @@ def _fit(slab: Slab, parts: Sequence[_Part], widest_m: float) -> _Fit | None:
             return None
         step = _newton_step(plain, rim, moments[_ON_PLANE, 1] - plain @ lean)
         lean = lean + step
-        if step @ plain @ step < (LARGE_STEP * slab.sigma_m) ** 2:
+        limit = SMALL_STEP if count < FEW_POINTS else LARGE_STEP
+        if step @ plain @ step < (limit * slab.sigma_m) ** 2:
             break
         sums = [claim.moments(_rest(claim.terms, lean), slab.sigma_m) for claim in claims]
     every = int(count) // SPREAD_POINTS + 1
