@@ -1,6 +1,7 @@
 """The joint estimate: exact data, noise, outliers, options, and data that determine nothing."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from lidarpose.model.turntable_result import TurntableEstimate
 from lidarpose.refine.turntable import JointOptions, refine_turntable
 from lidarpose.simulate.observations import Blunders, simulate_observations
 from lidarpose.simulate.rig import TurntableRig, draw_rig
+from lidarpose.storage.calibration import read_turntable_calibration, write_calibration
 
 
 def rough_start(rig: TurntableRig, size: float = 2e-3, seed: int = 0) -> TurntableMotion:
@@ -217,6 +219,33 @@ def test_an_encoder_scale_enters_pose_and_covariance() -> None:
     assert pose is not None
     xi = pose.pose.minus(rig.motion.pose(true))
     assert xi @ np.linalg.solve(pose.covariance, xi) < 20.0
+
+
+def test_an_encoder_scale_that_is_seen_only_is_paid_for_all_around(tmp_path: Path) -> None:
+    ratios = []
+    for seed in range(4):
+        rig = draw_rig(2 + seed, places=25)
+        observations = simulate_observations(rig, seed=seed, stripe_step_px=20.0)
+        scaled = replace(
+            observations,
+            places=tuple(replace(p, turntable_angle_rad=p.turntable_angle_rad / 1.02) for p in observations.places),
+        )
+        estimate = refine(rig, scaled)
+        assert estimate.motion.reading_scale == 1.0
+        assert estimate.parameter_names[10] == "encoder_scale"
+        write_calibration(tmp_path / "c.json", estimate.calibration())
+        known = read_turntable_calibration(tmp_path / "c.json")
+        middle = float(rig.turntable_angle_rad.mean())
+        for turn in (0.5 * np.pi, np.pi):
+            # What the table reads where it stands `turn` from the middle of the arc.
+            pose = known.uncertain_pose((middle + turn) / 1.02)
+            assert pose is not None
+            metres, radians = pose.pose.distance(rig.motion.pose(middle + turn))
+            ratios.append(radians / np.sqrt(np.trace(pose.rotation_covariance())))
+            ratios.append(metres / np.sqrt(np.trace(pose.centre_covariance())))
+    # Nearly all of the error is the effect's, squared once: both ways within a fifth (it was a hundred times).
+    assert min(ratios) > 0.8
+    assert max(ratios) < 1.25
 
 
 def test_unknown_options_are_refused() -> None:

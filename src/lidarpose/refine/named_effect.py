@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarpose.geometry.arrays import FloatArray
+from lidarpose.model.turntable import PARAMETER_NAMES
 from lidarpose.model.turntable_result import ExtraParameter
 from lidarpose.refine.contradictions import Explanation
 from lidarpose.refine.observability import PoseSpread
@@ -60,11 +61,14 @@ class NamedEffect:
         Whether it spoils the verdict; if not it is worth a note.
     move : (n,)
         How the parameters of `OutsideParameters` would change with it.
+    encoder_scale
+        What the readings' scale would be beside 1, for an effect of that kind.
     """
 
     text: str
     serious: bool
     move: FloatArray
+    encoder_scale: float = 0.0
 
 
 def strongest_effects(
@@ -86,9 +90,21 @@ def strongest_effects(
     return tuple(effect for score, effect in candidates if score > candidates[0][0] - _NEARLY_AS_GOOD)
 
 
-def paid_for(outside: OutsideParameters, effects: Sequence[NamedEffect]) -> OutsideParameters:
-    """The same with the effects' shifts, squared, in the covariance."""
-    return replace(outside, covariance=outside.covariance + sum(np.outer(e.move, e.move) for e in effects))
+def paid_for(outside: OutsideParameters, effects: Sequence[NamedEffect], reference_rad: float) -> OutsideParameters:
+    """The same with the effects' shifts, squared, in the covariance.
+
+    A scale of the readings that is seen spoils the pose by the distance from the recorded arc, which no covariance of
+    the ten numbers says: it becomes a parameter of its own then, of value 1, counted from `reference_rad`.
+    """
+    moves = [e.move for e in effects]
+    if any(e.encoder_scale for e in effects) and "encoder_scale" not in outside.names:
+        at = len(PARAMETER_NAMES)
+        names = (*outside.names[:at], "encoder_scale", *outside.names[at:])
+        covariance = np.insert(np.insert(outside.covariance, at, 0.0, axis=0), at, 0.0, axis=1)
+        motion = replace(outside.motion, reading_origin_rad=reference_rad)
+        outside = replace(outside, names=names, covariance=covariance, motion=motion)
+        moves = [np.insert(e.move, at, e.encoder_scale) for e in effects]
+    return replace(outside, covariance=outside.covariance + sum(np.outer(move, move) for move in moves))
 
 
 def shift_of(outside: OutsideParameters, effect: NamedEffect, reading_rad: float) -> tuple[float, float]:
@@ -111,7 +127,8 @@ def _from_extras(
         if extra.name == "encoder_scale":
             text += " (the farther from the recorded arc, the more it spoils the pose)"
         move = move_of_extra(solution, outside, extra.name, extra.value)
-        yield (extra.value / extra.sigma) ** 2 - _price(1), NamedEffect(text, large, move)
+        scale = extra.value if extra.name == "encoder_scale" else 0.0
+        yield (extra.value / extra.sigma) ** 2 - _price(1), NamedEffect(text, large, move, scale)
 
 
 def _that_matter(explanations: Sequence[Explanation], options: JointOptions) -> Iterator[tuple[float, Explanation]]:

@@ -135,7 +135,7 @@ def _assemble(
     effects = strongest_effects(solution, outside, options, extras, explanations(solution.suspicious or solution))
     stability = leave_places_out(solution, outside)
     directions = weak_directions(outside.motion, outside.covariance[:10, :10], angles)
-    outside = paid_for(outside, effects)
+    outside = paid_for(outside, effects, data.reference_rad)
     C = _of_motion(outside)
     noise = noise_estimates(solution)
     evidence = Evidence(
@@ -184,7 +184,7 @@ def _assemble(
 
 
 def _of_motion(outside: OutsideParameters) -> FloatArray:
-    """Covariance (10, 10) of the motion, (11, 11) with the readings' scale where that is estimated."""
+    """Covariance (10, 10) of the motion, (11, 11) with the readings' scale where that is estimated or seen."""
     keep = [*range(10), *(k for k, name in enumerate(outside.names) if name == "encoder_scale")]
     return np.asarray(outside.covariance[np.ix_(keep, keep)])
 

@@ -105,7 +105,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         "transforms": transforms,
         "scale": float(scale),
     }
-    if isinstance(calibration, TurntableCalibration) and calibration.motion.reading_scale != 1.0:
+    if isinstance(calibration, TurntableCalibration) and _knows_readings(calibration):
         motion = calibration.motion
         document["readings"] = {"scale": motion.reading_scale, "origin_rad": motion.reading_origin_rad}
     if isinstance(calibration, TurntableCalibration) and not calibration.beams.is_none:
@@ -120,6 +120,11 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         document["quality"] = {"verdict": quality.verdict, "reasons": list(quality.reasons), **quality.figures}
     document["provenance"] = dict(calibration.provenance)
     return document
+
+
+def _knows_readings(calibration: TurntableCalibration) -> bool:
+    """Whether a factor on readings is known or feared: its origin is then needed."""
+    return calibration.motion.reading_scale != 1.0 or "encoder_scale" in calibration.parameter_names
 
 
 def transform_entry(parent: str, child: str, pose: Pose, covariance: FloatArray | None = None) -> dict[str, Any]:
