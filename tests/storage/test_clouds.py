@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import errno
+import os
 import random
 import struct
 from pathlib import Path
@@ -423,6 +425,35 @@ def test_a_writer_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
             _fail_half_way(path)
         assert path.read_bytes() == before
     assert len(list(tmp_path.iterdir())) == len(CLOUD_SUFFIXES)
+
+
+@pytest.mark.parametrize("suffix", ["pcd", "ply", "npy"])
+def test_room_is_set_aside_for_large_clouds_and_a_full_disk_noticed(
+    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(0)
+    cloud = Cloud(rng.normal(size=(90_001, 3)).astype(np.float32), {"ring": np.arange(90_001, dtype=np.uint8)})
+    path = tmp_path / f"cloud.{suffix}"
+    asked: list[int] = []
+
+    def refuse(number: int) -> None:
+        def posix_fallocate(file: int, start: int, size: int) -> None:
+            asked.append(size)
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr(os, "posix_fallocate", posix_fallocate)
+
+    write_cloud(path, cloud)
+    usual = path.read_bytes()
+    refuse(errno.EOPNOTSUPP)
+    write_cloud(path, cloud)
+    assert path.read_bytes() == usual
+    assert asked == [13 * len(cloud)]
+    refuse(errno.ENOSPC)
+    with pytest.raises(InputError, match=r"[Nn]o space"):
+        write_cloud(path, cloud)
+    assert path.read_bytes() == usual
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_millimetres_are_noticed() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import os
 import re
 import sys
 import warnings
@@ -22,6 +24,9 @@ RGB = ("red", "green", "blue")
 _is_little = sys.byteorder == "little"
 BLOCK_BYTES = 1 << 17
 """Rows are put together and taken apart in blocks that stay in the cache; larger ones took twice the time."""
+
+
+RESERVED_FROM_BYTES = 1 << 20
 
 
 class CloudWriter(Protocol):
@@ -60,18 +65,39 @@ def write_rows(file: IO[bytes], columns: Columns, cloud: Cloud) -> None:
     """Append the cloud's rows to an open file, a block at a time."""
     columns.require_same(cloud)
     row = columns.row()
-    if not columns.fields and cloud.points.dtype == columns.xyz and cloud.points.flags.c_contiguous and _is_little:
+    _reserve(file, len(cloud) * row.itemsize)
+    as_they_lie = cloud.points.dtype == columns.xyz and cloud.points.flags.c_contiguous and _is_little
+    if as_they_lie and not columns.fields:
         file.write(cloud.points.reshape(-1).view(np.uint8).data)
         return
+    sources: dict[str, NDArray[Any]] = {name: cloud.points[:, axis] for axis, name in enumerate(XYZ)}
+    if as_they_lie and row.itemsize % columns.xyz.itemsize:
+        # In rows of odd lengths NumPy copies one long item twice as quickly as three numbers.
+        whole = np.dtype((np.void, 3 * columns.xyz.itemsize))
+        row = np.dtype([("xyz", whole), *((name, row[name]) for name in columns.fields)])
+        sources = {"xyz": cloud.points.view(whole)[:, 0]}
+    sources |= {name: cloud.fields[name] for name in columns.fields}
     buffer = np.empty(_block_rows(row, len(cloud)), dtype=row)
     for block in blocks(len(cloud), len(buffer)):
         part = buffer[: block.stop - block.start]
-        points = cloud.points[block]
-        for axis, name in enumerate(XYZ):
-            part[name] = points[:, axis]
-        for name in columns.fields:
-            part[name] = cloud.fields[name][block]
+        for name, source in sources.items():
+            part[name] = source[block]
         file.write(part.view(np.uint8).data)
+
+
+def _reserve(file: IO[bytes], size: int) -> None:
+    """Let the file system set aside room for what comes next.
+
+    ext4 flushes a file whose room is not yet set aside to the disk when it is renamed over another one (its option
+    auto_da_alloc), which takes longer than writing it to the page cache. A full disk is noticed here at the latest.
+    """
+    if size < RESERVED_FROM_BYTES or not hasattr(os, "posix_fallocate"):
+        return
+    try:
+        os.posix_fallocate(file.fileno(), file.tell(), size)
+    except OSError as error:
+        if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL, errno.ENODEV, errno.ESPIPE):
+            raise
 
 
 def read_rows(path: Path, offset: int, row: np.dtype[Any], count: int, *, skip: tuple[str, ...] = ()) -> Cloud:
