@@ -27,7 +27,7 @@ MARGIN_M = 0.01
 FIT_STEPS = 3
 # What lies about the target beyond its faces, for the planes that border it.
 AROUND_M = 0.15
-STANDING_ROUNDS, STANDING_HYPOTHESES, STANDING_VOXEL_M = 2, 250, 0.04
+STANDING_ROUNDS, STANDING_HYPOTHESES, STANDING_VOXEL_M = 2, 150, 0.04
 VOXEL_KEY = np.array([1, 1 << 20, 1 << 40])
 
 

@@ -40,6 +40,9 @@ class Cloud:
 
     def finite(self) -> Cloud:
         """The points without those that have a NaN or infinite coordinate (beams without return); fields likewise."""
+        if np.isfinite(self.points.sum()):
+            # One number that is not finite would show in the sum; a sum too large for the type is looked into.
+            return self
         keep = np.isfinite(self.points).all(axis=1)
         if keep.all():
             return self

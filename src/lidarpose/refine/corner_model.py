@@ -257,7 +257,12 @@ def _solve(information: FloatArray, gradient: FloatArray, what: str) -> FloatArr
 
 
 def fit_corner_model(
-    places: Sequence[CornerPlaceFaces], start: CornerState, sigma_m: float, options: CornerOptions | None = None
+    places: Sequence[CornerPlaceFaces],
+    start: CornerState,
+    sigma_m: float,
+    options: CornerOptions | None = None,
+    *,
+    settled: float = SETTLED,
 ) -> CornerFit:
     """The joint estimate.
 
@@ -269,6 +274,8 @@ def fit_corner_model(
         Where to start: the closed forms' result.
     sigma_m
         A first guess of the range noise; it is estimated with the rest.
+    settled
+        The last step, in standard deviations of the estimate, whatever the unit of each parameter.
 
     Raises
     ------
@@ -289,8 +296,7 @@ def fit_corner_model(
         state = _moved(state, delta, options)
         residuals = np.concatenate([f.residual for f in faces])
         sigma_m = max(mad_sigma(residuals, centred=True), MIN_SIGMA_M)
-        # Settled to a thousandth of a standard deviation, whatever the unit of each parameter.
-        if delta @ information @ delta < SETTLED**2 and step > 2:
+        if delta @ information @ delta < settled**2 and step > 2:
             break
     information, _, systems = _assemble(faces, state, world, sigma_m, options)
     residuals = np.concatenate([f.residual for f in faces])

@@ -101,6 +101,18 @@ def match_corners(
     return tuple(sorted(found.values(), key=lambda m: (-m.places, m.rms_m)))
 
 
+def match_of(corners: Sequence[CornerCandidate], world: FloatArray) -> CornerMatch | None:
+    """The match of one corner a place, faces in the same order at all; None if they do not fit the world."""
+    points = np.stack([c.corner for c in corners])
+    T = svd_pose(world, points)
+    error = np.linalg.norm(T @ points - world, axis=1)
+    turned = np.einsum("pij,ij->pi", np.stack([c.normals for c in corners]), corners[0].normals)
+    if error.max() > TOLERANCE_M or turned.min() < np.cos(SAME_ORIENTATION_RAD):
+        return None
+    rms = float(np.sqrt((error**2).mean()))
+    return CornerMatch(tuple(0 for _ in corners), tuple((0, 1, 2) for _ in corners), T, rms)
+
+
 @dataclass(frozen=True, eq=False)
 class Stray:
     """A corner at a place where none fits that is nearly the target's: what keeps it from fitting.

@@ -26,6 +26,7 @@ from lidarpose.solve.corner_matching import (
     CornerMatch,
     Stray,
     match_corners,
+    match_of,
     nearest_strays,
 )
 from lidarpose.workflows.moving_target import MIN_FACE_RETURNS, find_by_motion, load_points
@@ -42,6 +43,9 @@ SPOT_RAD = np.radians(1.2)
 ODD_SPOT_SIGMAS = 1.75
 # The share of a face next to the corner on which the first fit stands, before its far edges are trusted.
 INNER_SHARE = 0.6
+INNER_STEPS, FIT_STEPS = 2, 5
+# A corner that moved by no more since its beams were selected selects the same ones.
+SETTLED_M = 5e-4
 # What is cut out around the faces as sighted: the fitted corner may be this far from the sighted one.
 CROP_MARGIN_M = 0.15
 GOLDEN = 0.6180339887498949
@@ -159,9 +163,9 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
     if quick is not None:
         for _ in session.places:
             tick()
-        matches = match_corners([[c] for c in quick], world)
-        if matches and matches[0].places == len(world):
-            return _found(session, [[c] for c in quick], matches, world, "")
+        match = match_of(quick, world)
+        if match is not None:
+            return FoundTarget(tuple(quick), match, world, "", False)
 
     def corners_at(place: CornerPlace) -> tuple[CornerCandidate, ...]:
         found = place_corners(place, seed)
@@ -425,9 +429,12 @@ def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> Fre
     corner, normals = sighting.corner, sighting.normals
     fit: FreeCorner | None = None
     gate_m = max(FIRST_GATE_M, GATE_SIGMAS * sigma_m)
+    settled = False
     try:
-        for step in range(5):
-            inner = step < 2
+        for step in range(FIT_STEPS):
+            inner = step < INNER_STEPS
+            if settled and inner:
+                continue
             mask = mask_of(sighting, corner, normals, INNER_SHARE if inner else 1.0)
             faces = select_faces(crop, mask, gate_m, None if inner else sigma_m)
             if inner and (len(faces) < 3 or not _reaches_both_ways(faces)):
@@ -435,9 +442,13 @@ def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> Fre
                 continue
             if len(faces) < 3:
                 return None
-            fit = fit_corner(faces, normals, corner, sigma_m, tolerance_m=1e-5)
+            last = step == FIT_STEPS - 1
+            fit = fit_corner(faces, normals, corner, sigma_m, tolerance_m=1e-5 if last else 2e-4)
+            settled = bool(np.linalg.norm(fit.corner - corner) < SETTLED_M)
             corner, normals, sigma_m = fit.corner, fit.normals, fit.sigma_m
             gate_m = min(gate_m, max(GATE_SIGMAS * sigma_m, 0.002))
+            if settled and not inner:
+                break
     except UndeterminedError:
         return None
     return fit if np.linalg.norm(corner - sighting.corner) < CROP_MARGIN_M else None

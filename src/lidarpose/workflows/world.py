@@ -56,7 +56,8 @@ WORLD_METHODS: tuple[WorldMethod, ...] = ("joint", "paper", "paper-approx", "ran
 JOINT_WHISKER = 3.0
 MIN_FRAMES_FOR_BOX_PLOT = 5
 # Returns around the target, of all frames of a place together, from which the first estimate is made.
-FIRST_RETURNS = 6000
+FIRST_RETURNS = 4000
+FIRST_SETTLED = 0.1
 SMALL_TURN_RAD = np.radians(3.0)
 # Twice the gain in log likelihood at which uncertain world coordinates are believed in.
 CONVINCING_GAIN = 9.0
@@ -235,12 +236,16 @@ def _joint(
     start, sigma_m = _start(mended, found, fits)
     corners = _corners(start, fits, found)
     places, _ = observe(mended, found, few, corners, start.normals, sigma_m)
-    places, _, _ = _without_odd_frames(places, corners, start.normals, sigma_m)
-    fit, _ = _fit(mended, places, start, sigma_m, scale_too)
+    fit = _first_fit(mended, places, start, sigma_m, scale_too)
     # Then from all, with the faces' beams selected by the estimate itself.
     corners = _expected(fit, places, found.world)
     observed, left_out = observe(mended, found, crops, corners, fit.state.normals, fit.range_sigma_m)
-    places, frame_scatter, dropped = _without_odd_frames(observed, corners, fit.state.normals, fit.range_sigma_m)
+    by_frame = {
+        p.position: frame_corners(p.faces, fit.state.normals, corner, p.frames, fit.range_sigma_m)
+        for p, corner in zip(observed, corners, strict=True)
+        if len(p.faces) == 3 and p.frames > 1
+    }
+    places, frame_scatter, dropped = _without_odd_frames(observed, by_frame)
     fit, used = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too)
     left_out += [LeftOut(f"{name}: {n} frames", "their corner is far from the others'") for name, n in dropped.items()]
     evidence = CornerEvidence(
@@ -264,7 +269,7 @@ def _joint(
         quality,
         _provenance(session, "joint"),
     )
-    return joint_run(session, calibration, fit, used, observed)
+    return joint_run(session, calibration, fit, used, by_frame)
 
 
 def _expected(fit: CornerFit, places: Sequence[CornerPlaceFaces], world: FloatArray) -> FloatArray:
@@ -345,19 +350,19 @@ def _corners(start: CornerState, fits: Sequence[FreeCorner | None], found: Found
 
 
 def _without_odd_frames(
-    places: Sequence[CornerPlaceFaces], corners: FloatArray, normals: FloatArray, sigma_m: float
+    places: Sequence[CornerPlaceFaces], by_frame: Mapping[str, FloatArray]
 ) -> tuple[list[CornerPlaceFaces], dict[str, FloatArray], dict[str, int]]:
     """Leave out frames whose corner is far from the others', coordinate by coordinate (the paper's box plot)."""
     kept, scatter, dropped = [], {}, {}
-    for place, corner in zip(places, corners, strict=True):
-        if len(place.faces) == 3 and place.frames >= MIN_FRAMES_FOR_BOX_PLOT:
-            by_frame = frame_corners(place.faces, normals, corner, place.frames, sigma_m)
-            known = np.isfinite(by_frame).all(axis=1)
+    for place in places:
+        corners = by_frame.get(place.position)
+        if corners is not None and place.frames >= MIN_FRAMES_FOR_BOX_PLOT:
+            known = np.isfinite(corners).all(axis=1)
             good = np.ones(place.frames, dtype=bool)
             if known.sum() >= MIN_FRAMES_FOR_BOX_PLOT:
-                inside = [box_plot_inliers(by_frame[known, k], JOINT_WHISKER) for k in range(3)]
+                inside = [box_plot_inliers(corners[known, k], JOINT_WHISKER) for k in range(3)]
                 good[known] = np.all(inside, axis=0)
-                scatter[place.position] = by_frame[good & known].std(axis=0, ddof=1)
+                scatter[place.position] = corners[good & known].std(axis=0, ddof=1)
             if not good.all():
                 dropped[place.position] = int(np.count_nonzero(~good))
                 faces = {j: _frames_only(f, good) for j, f in place.faces.items()}
@@ -368,6 +373,16 @@ def _without_odd_frames(
 
 def _frames_only(returns: FaceReturns, good: Any) -> FaceReturns:
     return returns.subset(np.flatnonzero(good[returns.frame]))
+
+
+def _first_fit(
+    session: CornerSession, places: Sequence[CornerPlaceFaces], start: CornerState, sigma_m: float, scale_too: bool
+) -> CornerFit:
+    """An estimate good enough to select the faces' beams by, and to start from."""
+    used = [p for p in places if p.faces]
+    start = replace(start, world_errors=np.zeros((len(used), 3)))
+    options = CornerOptions(session.world_sigma_m or 0.0, scale_too)
+    return fit_corner_model(used, start, sigma_m, options, settled=FIRST_SETTLED)
 
 
 def _fit(

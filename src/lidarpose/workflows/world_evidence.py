@@ -11,7 +11,7 @@ from lidarpose.model.calibration import WorldCalibration
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import CornerSession
 from lidarpose.model.world_run import WorldPlace, WorldRun
-from lidarpose.refine.corner_model import CornerFit, frame_corners, place_discrepancies
+from lidarpose.refine.corner_model import CornerFit, place_discrepancies
 
 # More points than this a face say nothing new to the eye.
 MOST_POINTS_A_FACE = 2000
@@ -22,7 +22,7 @@ def joint_run(
     calibration: WorldCalibration,
     fit: CornerFit,
     used: Sequence[CornerPlaceFaces],
-    observed: Sequence[CornerPlaceFaces],
+    by_frame: Mapping[str, FloatArray],
 ) -> WorldRun:
     """The run of the joint estimate.
 
@@ -30,16 +30,14 @@ def joint_run(
     ----------
     used
         The places behind `fit`, without the frames that were left out.
-    observed
-        The same places (and perhaps more) with all their frames.
+    by_frame
+        By position: the corner of each of its frames (F, 3), left out or not.
     """
     moves, _, known = place_discrepancies(fit)
     own = fit.state.corners(fit.world) + np.where(known[:, None], moves[:, :3], 0.0)
-    whole = {place.position: place for place in observed}
     places = []
     for place, corner in zip(used, own, strict=True):
-        with_all = whole.get(place.position, place)
-        corners = _frame_corners(with_all, fit, corner)
+        corners = by_frame.get(place.position, np.zeros((0, 3)))
         kept = np.isin(np.arange(len(corners)), _frames(place.faces))
         faces = {k: _points(returns) for k, returns in sorted(place.faces.items())}
         places.append(WorldPlace(place.position, place.corner_world, corner, faces, corners, kept))
@@ -59,12 +57,6 @@ def corners_run(
         for position, (world, corner) in corners.items()
     ]
     return WorldRun(method, session, calibration, tuple(places))
-
-
-def _frame_corners(place: CornerPlaceFaces, fit: CornerFit, corner: FloatArray) -> FloatArray:
-    if len(place.faces) < 3 or place.frames < 2:
-        return np.zeros((0, 3))
-    return frame_corners(place.faces, fit.state.normals, corner, place.frames, fit.range_sigma_m)
 
 
 def _frames(faces: Mapping[int, FaceReturns]) -> FloatArray:
