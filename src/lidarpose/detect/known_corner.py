@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
-from lidarpose.detect.trihedral_corner import FaceMask, find_corners, in_outline
+from lidarpose.detect.trihedral_corner import FaceMask, corner_of_faces, in_outline
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
 from lidarpose.model.corner_result import CornerCandidate
@@ -98,12 +98,11 @@ def _sighting(
     patches = _shared_out(local, faces, standing, reference.sigma_m)
     if min(len(patch) for patch in patches[:3]) < FEWEST:
         return None
-    found = [
-        c
-        for c in find_corners(local, tuple(p for p in patches if len(p) >= FEWEST), corner, NEAR_M)
-        if c.convex == reference.convex and all(c.normals[k] @ faces[k][0].normal > 0.9999 for k in range(3))
-    ]
-    return found[0] if len(found) == 1 and _is_in_view(local, found[0], reference) else None
+    bordering = tuple(patch for patch in patches[3:] if len(patch) >= FEWEST)
+    found = corner_of_faces(local, (*patches[:3], *bordering))
+    if found is None or found.convex != reference.convex or np.linalg.norm(found.corner - corner) > NEAR_M:
+        return None
+    return found if _is_in_view(local, found, reference) else None
 
 
 def _within(points: NDArray[np.floating[Any]], centre: FloatArray, radius: float) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, cross3, perpendicular_pair
-from lidarpose.geometry.planes import Plane
+from lidarpose.geometry.planes import Plane, intersect_three_planes
 from lidarpose.model.corner_result import CornerCandidate
 from lidarpose.model.plane_patch import PlanePatch
 
@@ -56,6 +56,17 @@ def find_corners(
         triples, corners = triples[close], corners[close]
     found = [c for t, corner in zip(triples, corners, strict=True) if (c := _candidate(surfaces, t, corner))]
     return _without_doubles(sorted(found, key=lambda c: -c.support))
+
+
+def corner_of_faces(points: NDArray[np.floating], patches: tuple[PlanePatch, ...]) -> CornerCandidate | None:
+    """The corner of the first three of the patches (see `find_corners`), the others being what may border them."""
+    surfaces = [_Surface(p, points[p.indices].astype(np.float64)) for p in patches]
+    faces = [p.plane for p in patches[:3]]
+    try:
+        corner = intersect_three_planes((faces[0], faces[1], faces[2]))
+    except ValueError:
+        return None
+    return _candidate(surfaces, np.arange(3), corner)
 
 
 def _meeting_triples(surfaces: list[_Surface]) -> tuple[IntArray, FloatArray]:

@@ -21,7 +21,7 @@ from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.corner_result import CornerCandidate
 from lidarpose.model.corner_session import CloudSource, CornerSession
 from lidarpose.solve.corner_alignment import svd_pose
-from lidarpose.solve.corner_matching import TOLERANCE_M
+from lidarpose.solve.corner_matching import SAME_ORIENTATION_RAD, TOLERANCE_M, face_order
 
 MIN_FACE_RETURNS = 12
 FACE_RETURNS = 30
@@ -97,25 +97,42 @@ def _followed(
 ) -> list[CornerCandidate] | None:
     """The corner at all places, if it moves as the world coordinates say."""
     three = list(frames)
-    corners = np.stack(
-        [corner.corner if k == first else corner_of_normals(moved[k], corner.normals, corner.sigma_m) for k in three]
-    )
-    if not _as_far_apart(corners, world[three]):
-        return None
-    reference = _whole(frames[first], corner, search)
-    if reference is None:
-        return None
-    expected = svd_pose(world[three], corners).inverse() @ world
-    around = []
-    for k, place in enumerate(session.places):
-        points = frames[k] if k in frames else load_points(place.clouds[0])
-        around.append(surroundings(points, reference, expected[k]))
-    return sight_again(around, reference, expected, seed=search.seed)
+    reference: CornerCandidate | None = None
+    for elsewhere in (_by_normals, _by_search):
+        corners = np.stack([corner.corner if k == first else elsewhere(moved[k], corner, search) for k in three])
+        if not _as_far_apart(corners, world[three]):
+            continue
+        reference = reference or _whole(frames[first], corner, search)
+        if reference is None:
+            return None
+        expected = svd_pose(world[three], corners).inverse() @ world
+        around = []
+        for k, place in enumerate(session.places):
+            points = frames[k] if k in frames else load_points(place.clouds[0])
+            around.append(surroundings(points, reference, expected[k]))
+        sightings = sight_again(around, reference, expected, seed=search.seed)
+        if sightings is not None:
+            return sightings
+    return None
+
+
+def _by_normals(moved: Points, corner: CornerCandidate, search: PlaneSearch) -> FloatArray:
+    """Where the corner's faces are among the moved points of another place, by their normals alone."""
+    del search
+    return corner_of_normals(moved, corner.normals, corner.sigma_m)
+
+
+def _by_search(moved: Points, corner: CornerCandidate, search: PlaneSearch) -> FloatArray:
+    """Where the corner is, by a search of its own; far away where there is none."""
+    for other in find_corners(moved, segment_planes(moved, search)):
+        if other.convex == corner.convex and face_order(other.normals, corner.normals)[1] < SAME_ORIENTATION_RAD:
+            return other.corner
+    return np.full(3, np.inf)
 
 
 def _as_far_apart(corners: FloatArray, world: FloatArray) -> bool:
     pairs = ((0, 1), (0, 2), (1, 2))
-    return all(
+    return bool(np.isfinite(corners).all()) and all(
         abs(np.linalg.norm(corners[a] - corners[b]) - np.linalg.norm(world[a] - world[b])) < TOLERANCE_M
         for a, b in pairs
     )

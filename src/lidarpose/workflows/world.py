@@ -19,6 +19,7 @@ from lidarpose.model.corner_session import CornerSession
 from lidarpose.model.observation import LeftOut
 from lidarpose.model.world_run import WorldRun
 from lidarpose.refine.corner_model import (
+    SETTLED,
     CornerFit,
     CornerOptions,
     CornerState,
@@ -57,6 +58,7 @@ JOINT_WHISKER = 3.0
 MIN_FRAMES_FOR_BOX_PLOT = 5
 # Returns around the target, of all frames of a place together, from which the first estimate is made.
 FIRST_RETURNS = 4000
+# That estimate's last step, in standard deviations.
 FIRST_SETTLED = 0.1
 SMALL_TURN_RAD = np.radians(3.0)
 # Twice the gain in log likelihood at which uncertain world coordinates are believed in.
@@ -236,7 +238,7 @@ def _joint(
     start, sigma_m = _start(mended, found, fits)
     corners = _corners(start, fits, found)
     places, _ = observe(mended, found, few, corners, start.normals, sigma_m)
-    fit = _first_fit(mended, places, start, sigma_m, scale_too)
+    fit, _ = _fit(mended, places, start, sigma_m, scale_too, FIRST_SETTLED)
     # Then from all, with the faces' beams selected by the estimate itself.
     corners = _expected(fit, places, found.world)
     observed, left_out = observe(mended, found, crops, corners, fit.state.normals, fit.range_sigma_m)
@@ -375,29 +377,25 @@ def _frames_only(returns: FaceReturns, good: Any) -> FaceReturns:
     return returns.subset(np.flatnonzero(good[returns.frame]))
 
 
-def _first_fit(
-    session: CornerSession, places: Sequence[CornerPlaceFaces], start: CornerState, sigma_m: float, scale_too: bool
-) -> CornerFit:
-    """An estimate good enough to select the faces' beams by, and to start from."""
-    used = [p for p in places if p.faces]
-    start = replace(start, world_errors=np.zeros((len(used), 3)))
-    options = CornerOptions(session.world_sigma_m or 0.0, scale_too)
-    return fit_corner_model(used, start, sigma_m, options, settled=FIRST_SETTLED)
-
-
 def _fit(
-    session: CornerSession, places: Sequence[CornerPlaceFaces], start: CornerState, sigma_m: float, scale_too: bool
+    session: CornerSession,
+    places: Sequence[CornerPlaceFaces],
+    start: CornerState,
+    sigma_m: float,
+    scale_too: bool,
+    settled: float = SETTLED,
 ) -> tuple[CornerFit, list[CornerPlaceFaces]]:
     """The joint estimate over the places that have faces; the world's noise as stated, or as the data show it."""
     rows = [i for i, p in enumerate(places) if p.faces]
     used = [places[i] for i in rows]
     start = replace(start, world_errors=np.zeros((len(used), 3)))
     stated = session.world_sigma_m
-    fit = fit_corner_model(used, start, sigma_m, CornerOptions(stated or 0.0, scale_too))
+    fit = fit_corner_model(used, start, sigma_m, CornerOptions(stated or 0.0, scale_too), settled=settled)
     if stated is None:
         estimated, gain = estimate_world_sigma(fit)
         if gain > CONVINCING_GAIN:
-            fit = fit_corner_model(used, fit.state, fit.range_sigma_m, CornerOptions(estimated, scale_too))
+            options = CornerOptions(estimated, scale_too)
+            fit = fit_corner_model(used, fit.state, fit.range_sigma_m, options, settled=settled)
     return fit, used
 
 
