@@ -46,6 +46,12 @@ def test_pose_jacobian_agrees_with_differences() -> None:
         np.testing.assert_allclose(motion.pose_jacobian(angle), numeric, atol=1e-5)
 
 
+def test_many_readings_at_once_are_those_of_each() -> None:
+    motion, angles = random_motion(3), np.array([-2.0, 0.0, 0.4, 5.0])
+    np.testing.assert_allclose(motion.centres(angles), [motion.pose(a).translation for a in angles], atol=1e-15)
+    np.testing.assert_allclose(motion.pose_jacobians(angles), [motion.pose_jacobian(a) for a in angles], atol=1e-15)
+
+
 def test_the_mounting_covariance_has_no_freedom_across_the_radius() -> None:
     motion = random_motion(2)
     covariances = TurntableCalibration(motion, np.diag(np.arange(1.0, 11.0))).transform_covariances()

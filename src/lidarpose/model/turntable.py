@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from lidarpose.geometry.arrays import FloatArray
-from lidarpose.geometry.se3 import Pose, skew
+from lidarpose.geometry.se3 import Pose, rotation_z, skew
 
 PARAMETER_NAMES = (
     "T_camera_turntable.tx_m",
@@ -109,14 +109,29 @@ class TurntableMotion:
 
     def pose_jacobian(self, turntable_angle_rad: float) -> FloatArray:
         """Derivative (6, 10) of the left perturbation of ``pose(angle)`` by `PARAMETER_NAMES`."""
+        return np.asarray(self.pose_jacobians(np.array([turntable_angle_rad]))[0])
+
+    def pose_jacobians(self, turntable_angle_rad: FloatArray) -> FloatArray:
+        """The same (N, 6, 10) at readings (N,)."""
         t = self.T_turntable_lidar.translation
         mounting = np.zeros((6, 4))
         mounting[:, 0] = RADIUS_TO_TWIST
         # Turning the LiDAR about its own centre, not about the turntable's origin.
         mounting[:3, 1:] = skew(t)
         mounting[3:, 1:] = np.eye(3)
-        to_camera = (self.T_camera_turntable @ Pose.rot_z(self.true_angle(turntable_angle_rad))).adjoint()
-        return np.hstack([np.eye(6), to_camera @ mounting])
+        R = self.T_camera_turntable.rotation @ rotation_z(self.true_angle(turntable_angle_rad))
+        to_camera = np.zeros((len(R), 6, 6))
+        to_camera[:, :3, :3] = to_camera[:, 3:, 3:] = R
+        to_camera[:, :3, 3:] = skew(self.T_camera_turntable.translation) @ R
+        out = np.empty((len(R), 6, 10))
+        out[:, :, :6] = np.eye(6)
+        out[:, :, 6:] = to_camera @ mounting
+        return out
+
+    def centres(self, turntable_angle_rad: FloatArray) -> FloatArray:
+        """The LiDAR's centre (N, 3) in the camera frame at readings (N,)."""
+        R = self.T_camera_turntable.rotation @ rotation_z(self.true_angle(turntable_angle_rad))
+        return np.asarray(R @ self.T_turntable_lidar.translation + self.T_camera_turntable.translation)
 
     def pose_by_scale(self, turntable_angle_rad: float) -> FloatArray:
         """Derivative (6,) of the left perturbation of ``pose(angle)`` by `reading_scale`."""

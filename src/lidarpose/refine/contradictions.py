@@ -176,13 +176,14 @@ def _lags(solution: Solution, terms: _LineTerms) -> Iterator[Explanation]:
 def _moves(solution: Solution, terms: _LineTerms) -> Iterator[Explanation]:
     """The board moved (6 numbers), or the turntable slipped (1), once during the recording: the best moment of each."""
     data = solution.data
+    since = _since(terms, len(data.positions))
     board = np.zeros((12, 6))
     board[6:] = np.eye(6)
     slip = np.concatenate([_axis_twist(solution), np.zeros(6)])[:, None]
     for key, twist in (("moved-board", board), ("slip", slip)):
         best: tuple[float, int, FloatArray, FloatArray] | None = None
         for first in range(2, len(data.positions) - 1):
-            tested = _tested(solution, terms, terms.place >= first, twist)
+            tested = _explained(solution, twist, *(sums[first] for sums in since))
             if tested is not None and (best is None or tested[0] > best[0]):
                 best = (tested[0], first, tested[1], tested[2])
         if best is not None:
@@ -233,10 +234,25 @@ def _tested(
     solution: Solution, terms: _LineTerms, which: BoolArray, twist: FloatArray
 ) -> tuple[float, FloatArray, FloatArray] | None:
     """`twist` (12, m): how the added parameters move the place and the panel of the lines `which` (S,)."""
-    own = twist.T @ terms.own[which].sum(axis=0) @ twist
-    return _explain(
-        solution, own, twist.T @ terms.gradient[which].sum(axis=0), twist.T @ terms.cross[which].sum(axis=0)
-    )
+    sums = (part[which].sum(axis=0) for part in (terms.own, terms.gradient, terms.cross))
+    return _explained(solution, twist, *sums)
+
+
+def _explained(
+    solution: Solution, twist: FloatArray, own: FloatArray, gradient: FloatArray, cross: FloatArray
+) -> tuple[float, FloatArray, FloatArray] | None:
+    """The same from the sums (12, 12), (12,) and (12, n) over those lines."""
+    return _explain(solution, twist.T @ own @ twist, twist.T @ gradient, twist.T @ cross)
+
+
+def _since(terms: _LineTerms, places: int) -> tuple[FloatArray, ...]:
+    """Sums (P, ...) of the lines' equations from each place on to the last."""
+    sums = []
+    for part in (terms.own, terms.gradient, terms.cross):
+        of_place = np.zeros((places, *part.shape[1:]))
+        np.add.at(of_place, terms.place, part)
+        sums.append(np.cumsum(of_place[::-1], axis=0)[::-1])
+    return tuple(sums)
 
 
 def _tested_each(

@@ -46,12 +46,11 @@ def _effects(
 
     With the readings' scale as an eleventh number, (M, 3, 11).
     """
-    J = np.array([motion.pose_jacobian(float(a)) for a in angles_rad])
+    J = motion.pose_jacobians(angles_rad)
     if with_scale:
         by_scale = np.array([motion.pose_by_scale(float(a)) for a in angles_rad])
         J = np.concatenate([J, by_scale[:, :, None]], axis=2)
-    centres = np.array([motion.pose(float(a)).translation for a in angles_rad])
-    return J[:, :3] - skew(centres) @ J[:, 3:], J[:, 3:]
+    return J[:, :3] - skew(motion.centres(angles_rad)) @ J[:, 3:], J[:, 3:]
 
 
 def weak_directions(

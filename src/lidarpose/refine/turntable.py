@@ -163,14 +163,15 @@ def _assemble(
         if cause is not None:
             evidence = replace(evidence, findings=(cause,))
             quality = judge(evidence)
+    groups = residual_groups(solution)
     return TurntableEstimate(
         motion=outside.motion,
         panel_poses=panel_poses(solution, observations),
         parameter_names=outside.names,
         parameter_covariance=outside.covariance,
         noise=noise,
-        residuals=residual_groups(solution),
-        left_out=left_out_lines(solution, observations),
+        residuals=groups,
+        left_out=left_out_lines(solution, observations, groups),
         cost=0.5 * solution.equations.sum_of_squares,
         converged=solution.converged,
         iterations=solution.iterations,

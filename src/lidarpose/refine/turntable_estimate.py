@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -150,10 +150,12 @@ def residual_groups(solution: Solution) -> tuple[ResidualGroup, ...]:
     return tuple(groups)
 
 
-def left_out_lines(solution: Solution, observations: TurntableObservations) -> tuple[LeftOut, ...]:
-    """What was left out or lost much of its weight, in words."""
+def left_out_lines(
+    solution: Solution, observations: TurntableObservations, groups: Sequence[ResidualGroup]
+) -> tuple[LeftOut, ...]:
+    """What was left out or lost much of its weight, in words; `groups` as `residual_groups` makes them."""
     out = [*observations.left_out, *solution.data.left_out]
-    for group in residual_groups(solution):
+    for group in groups:
         if group.position is None:
             share = float((group.weights < 0.5).mean())
             if share > 0.02:
@@ -163,12 +165,12 @@ def left_out_lines(solution: Solution, observations: TurntableObservations) -> t
             continue
         what = {"stripes": "the stripe", "ranges": "the scan line"}[group.kind]
         name = f"{what} of {group.position} on panel {group.panel}"
-        off = float(np.median(group.values))
-        size = f"{off:+.2f} px" if group.kind == "stripes" else f"{1e3 * off:+.2f} mm"
         if not group.weights.any():
+            off = float(np.median(group.values))
+            size = f"{off:+.2f} px" if group.kind == "stripes" else f"{1e3 * off:+.2f} mm"
             out.append(LeftOut(name, f"it contradicts all other places: off by {size} in the middle"))
-        elif float((group.weights < 0.5).mean()) > 0.25:
-            out.append(LeftOut(f"{(group.weights < 0.5).mean():.0%} of {name}", "outliers"))
+        elif (share := np.count_nonzero(group.weights < 0.5) / len(group.weights)) > 0.25:
+            out.append(LeftOut(f"{share:.0%} of {name}", "outliers"))
     return tuple(out)
 
 

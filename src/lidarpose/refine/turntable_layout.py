@@ -6,6 +6,7 @@ A line is a stripe or a scan line on one panel at one place. What cannot be used
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -46,7 +47,7 @@ class Lines:
     def count(self) -> int:
         return len(self.place)
 
-    @property
+    @cached_property
     def line_of_row(self) -> IntArray:
         return np.repeat(np.arange(self.count), np.diff(self.start))
 
@@ -64,7 +65,12 @@ class StripeRows:
     ray_per_x: FloatArray
     ray_per_y: FloatArray
 
-    @property
+    @cached_property
+    def joined(self) -> FloatArray:
+        """The ray and its derivatives side by side (N, 15)."""
+        return np.concatenate([self.rays, *(getattr(self, name) for name in RAY_DERIVATIVES)], axis=1)
+
+    @cached_property
     def ray_size_px(self) -> FloatArray:
         """Length (N,) of the ray's derivative by a pixel."""
         return np.asarray(np.linalg.norm(self.ray_per_px, axis=1))
@@ -81,6 +87,11 @@ class RangeRows:
     angle_rad: FloatArray
     range_m: FloatArray
     darkness: FloatArray
+
+    @cached_property
+    def beams(self) -> FloatArray:
+        """Directions (2, N) in the scan plane."""
+        return np.stack([np.cos(self.angle_rad), np.sin(self.angle_rad)])
 
 
 @dataclass(frozen=True, eq=False)

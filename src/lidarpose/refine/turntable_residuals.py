@@ -14,7 +14,7 @@ import numpy as np
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.se3 import Pose, skew
 from lidarpose.model.camera import Camera
-from lidarpose.refine.turntable_layout import RAY_DERIVATIVES, JointData, StripeRows, stripe_rays
+from lidarpose.refine.turntable_layout import JointData, StripeRows, stripe_rays
 from lidarpose.refine.turntable_parameters import (
     BEAM,
     BLACK,
@@ -172,7 +172,7 @@ def _stripe_products(rows: StripeRows, R_panel: FloatArray, light_normal: FloatA
     with the light plane's (S, 3); last the ray and its derivative by a pixel with the panel's two axes. One small
     matrix product a line.
     """
-    joined = np.concatenate([rows.rays, *(getattr(rows, name) for name in RAY_DERIVATIVES)], axis=1)
+    joined = rows.joined
     factors = np.zeros((rows.lines.count, 15, 14))
     for k in range(5):
         factors[:, 3 * k : 3 * k + 3, 2 * k] = R_panel[:, :, 2]
@@ -193,7 +193,7 @@ def range_residuals(data: JointData, state: JointState) -> LineResiduals:
     R_panel, t_panel, map_panel = _panel_geometry(data, state)
     offset_m, scale, beam, black = state.extras[np.array([OFFSET, RANGE_SCALE, BEAM, BLACK]) - N_MOTION]
     angle = (1.0 + beam) * rows.angle_rad
-    c, s = np.cos(angle), np.sin(angle)
+    c, s = rows.beams if beam == 0.0 else (np.cos(angle), np.sin(angle))
     # The panel's normal in the LiDAR frame, one a line: beams then need two products each.
     n_lidar = np.einsum("sij,si->sj", R_place[lines.place], R_panel[lines.slot, :, 2])[of_row]
     height = np.einsum("si,si->s", R_panel[lines.slot, :, 2], t_panel[lines.slot] - t_place[lines.place])[of_row]
@@ -205,10 +205,9 @@ def range_residuals(data: JointData, state: JointState) -> LineResiduals:
     predicted, inverse = np.where(valid, predicted, 0.0), np.where(valid, inverse, 0.0)
     # Coordinates on the panel are linear in the beam's foot: origin and two directions, one each a line.
     to_panel = np.swapaxes(R_panel[lines.slot], 1, 2)
-    start = np.einsum("sij,sj->si", to_panel, t_place[lines.place] - t_panel[lines.slot])[of_row]
-    axes = (to_panel @ R_place[lines.place])[of_row]
-    X = start[:, 0] + predicted * (c * axes[:, 0, 0] + s * axes[:, 0, 1])
-    Y = start[:, 1] + predicted * (c * axes[:, 1, 0] + s * axes[:, 1, 1])
+    start = np.einsum("sij,sj->si", to_panel, t_place[lines.place] - t_panel[lines.slot])
+    axes = to_panel @ R_place[lines.place]
+    X, Y = (start[:, k][of_row] + predicted * (c * axes[:, k, 0][of_row] + s * axes[:, k, 1][of_row]) for k in range(2))
     grow = inverse * (1.0 + scale)
     d_angle = -predicted * (-s * n_lidar[:, 0] + c * n_lidar[:, 1]) * grow
     flag = valid.astype(np.float64)

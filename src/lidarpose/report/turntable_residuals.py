@@ -32,7 +32,7 @@ def residuals_by_place(run: TurntableRun, estimate: TurntableEstimate, kind: Kin
     if not rows:
         return None
     sigma = _SCALE[kind] * estimate.noise[kind].sigma
-    ends = np.concatenate([np.percentile(values, [5.0, 95.0]) for _, _, values in rows])
+    ends = np.concatenate([_quantiles(values, _BOX[[0, 4]]) for _, _, values in rows])
     reach = max(3.2 * sigma, float(np.percentile(np.abs(ends), 98.0)) * 1.08)
     last = max(order.values())
 
@@ -173,8 +173,20 @@ def _boxes(rows: Sequence[tuple[int, FloatArray]], together: int) -> tuple[Float
     for place, values in rows:
         groups.setdefault((place - 1) // together, []).append(values)
     at = np.array([1.0 + (k + 0.5) * together - 0.5 for k in groups])
-    five = [np.percentile(np.concatenate(values), [5.0, 25.0, 50.0, 75.0, 95.0]) for values in groups.values()]
+    five = [_quantiles(np.concatenate(values), _BOX) for values in groups.values()]
     return at, np.array(five).reshape(-1, 5)
+
+
+_BOX = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
+
+
+def _quantiles(values: FloatArray, shares: FloatArray) -> FloatArray:
+    """As numpy's, of finite values, at a fraction of its overhead."""
+    ordered = np.sort(values)
+    at = shares * (len(ordered) - 1)
+    below = at.astype(np.intp)
+    low, high = ordered[below], ordered[np.minimum(below + 1, len(ordered) - 1)]
+    return np.asarray(low + (high - low) * (at - below))
 
 
 def _image_chart(width: float, columns: int, rows: int, description: str) -> Chart:
