@@ -76,9 +76,10 @@ $(BENCH_STAMP): requirements-bench.lock pyproject.toml
 bench: setup
 	$(BENCH_PYTHON) -m benchmarks.run --write
 
-# The same again, saying which figures differ from the stored ones by more than their tolerance.
+# The same again, saying which figures differ from the stored ones by more than their tolerance; fails where one is worse.
+# SUITES="files plane_search" runs those alone.
 bench-compare: setup
-	$(BENCH_PYTHON) -m benchmarks.run --compare docs/benchmarks.json
+	$(BENCH_PYTHON) -m benchmarks.run --compare docs/benchmarks.json $(if $(SUITES),--only $(SUITES))
 
 # The same with small sizes, printed only: minutes, to see that all works.
 bench-quick: setup

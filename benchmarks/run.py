@@ -3,6 +3,7 @@
     python -m benchmarks.run [--quick] [--only SUITE ...] [--write] [--compare docs/benchmarks.json]
 
 Without `--write` the page goes to standard output. `--only` with `--write` keeps the other suites' results as they are.
+`--compare` prints what differs by more than its tolerance; the exit status is 1 where a figure is worse.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from benchmarks.metrics import BY_KEY
-from benchmarks.page import drawings, measured, page
+from benchmarks.page import busy, drawings, measured, page
 from benchmarks.report import Effort, Report
 
 SUITES = (
@@ -81,15 +83,52 @@ def _failed(name: str) -> dict[str, Any]:
     return {**report.as_json(), "failed": True}
 
 
-def compare(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """Figures that differ by more than their tolerance."""
+@dataclass(frozen=True)
+class Comparison:
+    """Two runs side by side: figures that differ by more than their tolerance, those that only one run has, and those
+    that are seconds of a busy machine; in words, but for the number of figures that agree."""
+
+    agree: int
+    better: list[str]
+    worse: list[str]
+    alone: list[str]
+    unjudged: list[str]
+
+    def lines(self) -> list[str]:
+        """For the terminal."""
+        parts = (
+            ("Worse", self.worse),
+            ("Better", self.better),
+            ("Not compared, for one of the machines was busy", self.unjudged),
+            ("Measured in one of the runs only", self.alone),
+        )
+        lines = [line for title, found in parts if found for line in (f"{title}:", *(f"  {one}" for one in found))]
+        judged = self.agree + len(self.better) + len(self.worse)
+        return [*lines, f"{self.agree} of {judged} figures are the same within their tolerances."]
+
+
+def compare(before: dict[str, Any], now: dict[str, Any]) -> Comparison:
+    """Hold a run against an earlier one. Raises ValueError where one was quick and the other was not."""
+    if before["quick"] != now["quick"]:
+        raise ValueError("a quick run and a whole one measure different sizes")
     old, new = measured(before), measured(now)
-    out = []
+    suites = before["suites"].keys() & now["suites"].keys()
+    asked = {key for run in (before, now) for name in suites for key in run["suites"][name]["figures"]}
+    agree = 0
+    better: list[str] = []
+    worse: list[str] = []
+    unjudged: list[str] = []
     for key in sorted(old.keys() & new.keys()):
         metric = BY_KEY[key]
-        if not metric.agrees(old[key], new[key]):
-            out.append(f"{key}: {old[key]:.3g} before, {new[key]:.3g} now; tolerance {100 * metric.tolerance:.0f} %")
-    return out
+        line = f"{key}: {old[key]:.3g} before, {new[key]:.3g} now; tolerance {100 * metric.tolerance:.0f} %"
+        if metric.unit in ("s", "ms") and (busy(before) or busy(now)):
+            unjudged.append(line)
+        elif metric.agrees(old[key], new[key]):
+            agree += 1
+        else:
+            (better if (new[key] < old[key]) == (metric.better == "lower") else worse).append(line)
+    alone = [f"{key}: {'before' if key in old else 'now'}" for key in sorted(asked & (old.keys() ^ new.keys()))]
+    return Comparison(agree, better, worse, alone, unjudged)
 
 
 def main() -> None:
@@ -105,14 +144,19 @@ def main() -> None:
         report = import_module(f"benchmarks.suites.{options.suite}").run(Effort(options.quick))
         options.json.write_text(json.dumps(report.as_json()))
         return
+    # Read now: --write may replace it.
+    before = json.loads(options.compare.read_text(encoding="utf-8")) if options.compare else None
+    if before is not None and before["quick"] != options.quick:
+        parser.error(f"{options.compare} is of a {'quick' if before['quick'] else 'whole'} run, this one would not be")
     results = everything(options.only or SUITES, options.quick, options.write)
-    if options.compare:
-        different = compare(json.loads(options.compare.read_text(encoding="utf-8")), results)
-        print("\n".join(different) or "every figure is within its tolerance")
+    failed = any(suite.get("failed") for suite in results["suites"].values())
+    if before is not None:
+        comparison = compare(before, results)
+        print("\n".join(comparison.lines()))
+        failed |= bool(comparison.worse)
     elif not options.write:
         print(page(results))
-    if any(suite.get("failed") for suite in results["suites"].values()):
-        sys.exit(1)
+    sys.exit(int(failed))
 
 
 def everything(names: tuple[str, ...] | list[str], quick: bool, write: bool) -> dict[str, Any]:

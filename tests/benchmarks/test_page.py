@@ -1,5 +1,7 @@
 """The measuring house itself: the list, the page, the comparison, the limits. Nothing here is timed."""
 
+from typing import Any
+
 import pytest
 from benchmarks.limits import motion_bound, pose_limits
 from benchmarks.metrics import BY_KEY, METRICS, Metric
@@ -11,7 +13,7 @@ from benchmarks.timing import exponent, interleaved
 from lidarpose.simulate.rig import draw_rig
 
 
-def results(value: float, load: float = 0.1) -> dict[str, object]:
+def results(value: float, load: float = 0.1) -> dict[str, Any]:
     report = Report(
         {"start.help_s": value},
         [Table("Starting", ["process", "s"], [["lidarpose", 0.1234], ["open3d", None]])],
@@ -52,9 +54,28 @@ def test_a_busy_machine_is_told() -> None:
 
 
 def test_two_runs_are_compared_within_the_tolerance() -> None:
-    assert compare(results(0.1), results(0.12)) == []
-    (line,) = compare(results(0.1), results(0.2))
+    same = compare(results(0.1), results(0.12))
+    assert same.lines() == ["1 of 1 figures are the same within their tolerances."]
+    slower, faster = compare(results(0.1), results(0.2)), compare(results(0.2), results(0.1))
+    (line,) = slower.worse
     assert line.startswith("start.help_s: 0.1 before, 0.2 now")
+    assert slower.lines()[-1].startswith("0 of 1")
+    assert len(faster.better) == 1
+    assert not faster.worse
+
+
+def test_what_cannot_be_compared_is_said() -> None:
+    seconds_of_a_busy_machine = compare(results(0.1), results(0.9, load=7.0))
+    assert not seconds_of_a_busy_machine.worse
+    assert len(seconds_of_a_busy_machine.unjudged) == 1
+    less = results(0.1)
+    less["suites"]["starting"]["figures"] = {}
+    assert compare(results(0.1), less).alone == ["start.help_s: before"]
+    # A suite that was not run again is no difference.
+    less["suites"] = {}
+    assert compare(results(0.1), less).lines() == ["0 of 0 figures are the same within their tolerances."]
+    with pytest.raises(ValueError, match="quick"):
+        compare(results(0.1), {**results(0.1), "quick": True})
 
 
 def test_a_drawing_is_well_formed() -> None:
