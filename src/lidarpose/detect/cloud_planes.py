@@ -25,7 +25,7 @@ from lidarpose.model.plane_patch import PlanePatch
 Float32Array = NDArray[np.float32]
 
 SAMPLE_SIZE = 4096
-PLANES_AT_ONCE = 32
+PLANES_AT_ONCE = 16
 # From this many points on, patches are found and tested in a subsample, and the whole cloud is asked once.
 DENSE = 200_000
 DENSE_SAMPLE = 8192
@@ -39,9 +39,12 @@ HYPOTHESES = 1000
 # across the gaps between the lines of a multi-beam LiDAR, narrow ones fit on small faces.
 NEIGHBOURHOODS = (10, 20)
 THINNED = 4
-# Of the hypotheses with most votes, how many are compared by their largest connected patch.
+# Of the hypotheses with most votes, how many are compared by their largest connected patch, and how often the best is
+# refitted on the subsample. In a dense cloud that is done on more points afterwards.
 RIVALS = 4
+REFITS = 3
 DENSE_RIVALS = 2
+DENSE_REFITS = 1
 POINTS_PER_HYPOTHESIS = 10
 GATE_SIGMAS = 3.0
 MIN_SIGMA_M = 2e-4
@@ -101,6 +104,7 @@ class _Sample:
     sigma_m: float
     seeds: _Seeds | None = None
     rivals: int = RIVALS
+    refits: int = REFITS
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +181,7 @@ def _harvest_dense(
     fewest = max(int(least / share), FEWEST_OF_SAMPLE)
     jury = _one_of_each(len(few), SAMPLE_SIZE, rng)
     sample = _draw(few, jury, sigma_m, replace(search, hypotheses=min(search.hypotheses, DENSE_HYPOTHESES)), rng)
-    sample.rivals = DENSE_RIVALS
+    sample.rivals, sample.refits = DENSE_RIVALS, DENSE_REFITS
     seen = _harvest(few, np.ones(len(few), dtype=bool), sample, fewest, at_most)
     slabs = [Slab.around(few[p.indices], p.plane, p.sigma_m) for p in seen]
     if not slabs:
@@ -195,8 +199,10 @@ def _harvest_dense(
             local = x[claim.around].astype(np.float32)
             if not _stands_out(local, patch.plane.normal, patch.plane.offset, patch.sigma_m):
                 continue
-        free[patch.indices] = False
         found.append(patch)
+    if len(found) < at_most:
+        for patch in found:
+            free[patch.indices] = False
     return found
 
 
@@ -334,7 +340,7 @@ def _best_patch(sample: _Sample, active: Float32Array, votes: Float32Array) -> t
             best = int(component.sum()), plane, component, int(leader)
     assert best is not None
     _, plane, component, leader_index = best
-    for _ in range(3):
+    for _ in range(sample.refits):
         if component.sum() < 6:
             break
         plane = _moment_plane(sample.points[component])
