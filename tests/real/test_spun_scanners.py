@@ -75,10 +75,11 @@ def test_the_room_of_a_rotating_scanner_comes_out_square() -> None:
     assert abs(factor - 180.0 / 175.0) < 2.0 * sigma < 0.02
     assert not [e for e in run.estimate.extras if e.suggested]
     assert off_square_deg(run, 5).max() < 1.0
+    assert run.estimate.jumps == ()
 
 
 @pytest.mark.slow
-def test_a_corridor_from_a_mount_that_sticks_is_not_called_good() -> None:
+def test_a_corridor_with_lost_sweeps_is_not_called_good() -> None:
     recording = corridor()
     # Between two sweeps, half a degree apart by the file, the floor jumps for all beams at once: seen from half a metre
     # above it, its distance grows by what takes 4 degrees and more. No mounting and no factor does that.
@@ -91,3 +92,8 @@ def test_a_corridor_from_a_mount_that_sticks_is_not_called_good() -> None:
     run = calibrate_by_flatness(recording, axis_in_fan(np.pi / 2.0))
     assert run.estimate.quality.verdict == "doubtful"
     assert np.degrees(np.sqrt(np.diag(run.estimate.covariance)[:2])).max() > 0.3
+    # It is found unaided, and so are others.
+    jumps = {jump.sweeps: np.degrees(jump.seen_rad - jump.stated_rad) for jump in run.estimate.jumps}
+    assert jumps[26, 27] == pytest.approx(3.2, abs=0.5)
+    assert len(jumps) >= 3
+    assert any("sweeps were lost" in reason for reason in run.estimate.quality.reasons)

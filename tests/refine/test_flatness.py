@@ -34,14 +34,17 @@ def seen(
     sweeps: int = 60,
     beams: int = 90,
     slip_rad: float = 0.0,
+    jump_rad: float = 0.0,
 ) -> FlatReturns:
-    """What each sweep's half fan returns: the nearest plane, ray by ray. Readings may be off."""
+    """What each sweep's half fan returns: the nearest plane, ray by ray. Readings may be off,
+    each by itself or from somewhere on."""
     rng = np.random.default_rng(seed)
     readings = np.linspace(0.0, 2.0 * np.pi, sweeps, endpoint=False)
     angles = np.linspace(-1.4, 1.4, beams)
     columns: list[list[float]] = []
     for i, reading in enumerate(readings):
-        pose = Pose.rot_z(float(reading + slip_rad * rng.normal())) @ T_table_lidar
+        jump = jump_rad if i >= 5 * sweeps // 12 else 0.0
+        pose = Pose.rot_z(float(reading + jump + slip_rad * rng.normal())) @ T_table_lidar
         for angle in angles:
             d = pose.rotation @ np.array([np.cos(angle), np.sin(angle), 0.0])
             with np.errstate(divide="ignore"):
@@ -183,6 +186,22 @@ def test_readings_that_slip_are_named() -> None:
     # The worst sweeps are outliers to the estimate, so that it says less than is there.
     assert 0.25 < np.degrees(estimate.reading_scatter_rad) < 0.8
     assert any("slips" in reason for reason in estimate.quality.reasons)
+
+
+@pytest.mark.parametrize("jump_deg", [2.0, -3.0])
+def test_a_table_that_slips_once_is_named_with_its_place(jump_deg: float) -> None:
+    truth = mounted((0.8, -0.6), (0.02, -0.01))
+    planes = planes_of(WALLS + FLOOR_AND_CEILING)
+    returns = seen(planes, truth, noise_m=0.005, seed=5, sweeps=120, beams=60, jump_rad=np.radians(jump_deg))
+    estimate = refine_mounting(returns, UPRIGHT)
+    (jump,) = estimate.jumps
+    assert jump.sweeps == (49, 50)
+    assert np.degrees(jump.stated_rad) == pytest.approx(3.0)
+    assert np.degrees(jump.seen_rad) == pytest.approx(3.0 + jump_deg, abs=0.4)
+    assert estimate.quality.verdict == "doubtful"
+    assert any("between sweeps 49 and 50" in reason for reason in estimate.quality.reasons)
+    sound = refine_mounting(seen(planes, truth, noise_m=0.005, seed=5, sweeps=120, beams=60), UPRIGHT)
+    assert sound.jumps == ()
 
 
 @pytest.mark.parametrize("rows", [FLOOR_AND_CEILING, FLOOR_AND_CEILING[:1], WALLS[:2]])

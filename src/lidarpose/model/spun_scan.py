@@ -62,6 +62,23 @@ class FlatSurface:
     pull: float
 
 
+@dataclass(frozen=True)
+class ReadingJump:
+    """Two sweeps between which the table turned by something else than its readings say.
+
+    Attributes
+    ----------
+    sweeps
+        Their numbers in the recording, from 0.
+    stated_rad, seen_rad
+        By how much by the readings, and by what the beams saw.
+    """
+
+    sweeps: tuple[int, int]
+    stated_rad: float
+    seen_rad: float
+
+
 @dataclass(frozen=True, eq=False)
 class MountingEstimate:
     """How a LiDAR sits on its turntable, from the flatness of what it sees.
@@ -84,6 +101,8 @@ class MountingEstimate:
         What parts of the surfaces are off by beyond their noise: root mean square over all parts.
     reading_scatter_rad
         What single sweeps' readings seem to be off by beyond their noise: root mean square.
+    jumps
+        Of the readings, the largest first.
     spread_factor
         By how much more the surfaces disagree with each other than their patches say; the covariance is widened by it
         where it is above 1.
@@ -97,6 +116,7 @@ class MountingEstimate:
     surfaces: tuple[FlatSurface, ...]
     bending_m: float
     reading_scatter_rad: float
+    jumps: tuple[ReadingJump, ...]
     spread_factor: float
     converged: bool
     quality: Quality

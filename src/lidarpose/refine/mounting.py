@@ -12,7 +12,7 @@ from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.se3 import Pose, skew
 from lidarpose.model.beam_correction import BeamCorrection
 from lidarpose.model.calibration import Quality, TurntableCalibration
-from lidarpose.model.spun_scan import FlatReturns, FlatSurface, MountingEstimate
+from lidarpose.model.spun_scan import FlatReturns, FlatSurface, MountingEstimate, ReadingJump
 from lidarpose.model.turntable import PARAMETER_NAMES
 from lidarpose.model.turntable_result import ExtraParameter
 from lidarpose.refine.flatness import (
@@ -27,6 +27,7 @@ from lidarpose.refine.flatness import (
     solve,
     start_state,
 )
+from lidarpose.refine.reading_jumps import reading_jumps
 from lidarpose.refine.turntable_state import regular_motion
 
 # A mounting less certain than this is not known; the estimate may then be anywhere.
@@ -122,8 +123,9 @@ def refine_mounting(
     tested = _extras(solution, evidence, options.estimate, covariance)
     bent = bending(solution, returns)
     scatter = reading_scatter(solution, returns)
+    jumps = reading_jumps(solution, returns)
     surfaces = _surfaces(solution, evidence, returns)
-    quality = _quality(solution, evidence, tested, covariance, bent, scatter, surfaces, options)
+    quality = _quality(solution, evidence, tested, covariance, bent, scatter, jumps, surfaces, options)
     return MountingEstimate(
         solution.state.T_table_lidar,
         origin_rad,
@@ -133,6 +135,7 @@ def refine_mounting(
         surfaces,
         bent,
         scatter,
+        jumps,
         evidence.spread_factor,
         solution.converged,
         quality,
@@ -222,6 +225,7 @@ def _quality(
     covariance: FloatArray,
     bent: float,
     scatter: float,
+    jumps: Sequence[ReadingJump],
     surfaces: Sequence[FlatSurface],
     options: MountingOptions,
 ) -> Quality:
@@ -231,6 +235,8 @@ def _quality(
     reasons = [_suggestion(extra) for extra in extras if extra.suggested]
     if not solution.converged:
         reasons.append("the estimate did not settle: the start may be too far off, or the scene not flat enough")
+    if jumps:
+        reasons.append(_slipped(jumps))
     if scatter > LARGEST_READING_SCATTER_RAD:
         reasons.append(
             f"single sweeps' readings seem to be off by {np.degrees(scatter):.2f} deg or more: a table that slips, "
@@ -258,9 +264,27 @@ def _quality(
         "range_noise_mm": 1e3 * typical,
         "bending_mm": 1e3 * bent,
         "reading_scatter_deg": float(np.degrees(scatter)),
+        "reading_jumps": [
+            {
+                "sweeps": list(jump.sweeps),
+                "stated_deg": float(np.degrees(jump.stated_rad)),
+                "seen_deg": float(np.degrees(jump.seen_rad)),
+            }
+            for jump in jumps
+        ],
         "spread_factor": evidence.spread_factor,
     }
     return Quality("doubtful" if reasons else "good", tuple(reasons), figures)
+
+
+def _slipped(jumps: Sequence[ReadingJump]) -> str:
+    worst = jumps[0]
+    more = f", and {len(jumps) - 1} times more" if len(jumps) > 1 else ""
+    return (
+        f"between sweeps {worst.sweeps[0]} and {worst.sweeps[1]} the table turned by {np.degrees(worst.seen_rad):.1f} deg "
+        f"where its readings say {np.degrees(worst.stated_rad):.1f}{more}: it slips or sticks, or sweeps were lost; no "
+        "mounting mends that"
+    )
 
 
 def _suggestion(extra: ExtraParameter) -> str:
