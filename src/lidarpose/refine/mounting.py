@@ -280,10 +280,11 @@ def _quality(
 def _slipped(jumps: Sequence[ReadingJump]) -> str:
     worst = jumps[0]
     more = f", and {len(jumps) - 1} times more" if len(jumps) > 1 else ""
+    first, second = worst.sweeps
+    seen, stated = np.degrees(worst.seen_rad), np.degrees(worst.stated_rad)
     return (
-        f"between sweeps {worst.sweeps[0]} and {worst.sweeps[1]} the table turned by {np.degrees(worst.seen_rad):.1f} deg "
-        f"where its readings say {np.degrees(worst.stated_rad):.1f}{more}: it slips or sticks, or sweeps were lost; no "
-        "mounting mends that"
+        f"between sweeps {first} and {second} the table turned by {seen:.1f} deg where its readings say {stated:.1f}"
+        f"{more}: it slips or sticks, or sweeps were lost; no mounting mends that"
     )
 
 

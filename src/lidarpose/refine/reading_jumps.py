@@ -40,7 +40,7 @@ class _Step:
 
 
 def reading_jumps(solution: Solution, returns: FlatReturns) -> tuple[ReadingJump, ...]:
-    """The jumps of a recording, the largest first. Steps are compared with the typical one, which a factor spoils alike."""
+    """The jumps of a recording, the largest first. Compared with the typical step, which a factor spoils alike."""
     steps = _steps(solution, returns)
     if len(steps) < 5:
         return ()
