@@ -39,10 +39,13 @@ def png_header(path: Path, data: bytes) -> PngHeader:
     """The header of a PNG's bytes, after a look whether its chunks are all there (InputError if not)."""
     offset = len(SIGNATURE)
     kinds = set()
-    while offset + 12 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, offset)
-        kinds.add(kind)
+    chunk, end = struct.Struct(">I4s").unpack_from, len(data) - 12
+    while offset <= end:
+        length, kind = chunk(data, offset)
         offset += 12 + length
+        if kind == b"IDAT":  # nearly all of them
+            continue
+        kinds.add(kind)
         if kind == b"IEND" and offset <= len(data):
             first = len(SIGNATURE) + 8
             width, height = struct.unpack_from(">II", data, first)

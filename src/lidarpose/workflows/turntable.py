@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import chain, groupby
+from itertools import chain, groupby, pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,13 +48,13 @@ _Stripes = tuple[Mapping[int, StripePoints], list[LeftOut]]
 _Detected = tuple[Mapping[str, "BoardDetection"], Sequence[tuple[ScanLine, ...] | LeftOut], Sequence[_Stripes]]
 
 IMAGES_AT_ONCE = 8
-"""Stripe images that are fitted together: enough that single ones cost little, few enough for memory and progress."""
+"""Most stripe images that are fitted together: enough that single ones cost little, few for memory and progress."""
 
 BATCHES_AHEAD = 4
 """So many batches of images are decoded while earlier ones are searched; more would only take memory."""
 
 LEAST_BATCHES = 3
-"""With fewer there is too little to share."""
+"""With fewer there is too little to share; with more their number is a multiple of four, for two or four processes."""
 
 MOST_CONTRADICTING = 0.15
 """Share of the places with both stripes that may contradict the others before the whole is in doubt."""
@@ -359,9 +359,16 @@ def _find_scan_lines(session: TurntableSession, place: TurntablePlace) -> tuple[
 
 
 def _batches(places: Sequence[TurntablePlace]) -> list[Batch]:
-    """Places in their order, some at a time, all of one placement of the board each time."""
-    groups = [list(group) for _, group in groupby(places, key=lambda place: place.placement)]
-    return [group[k : k + IMAGES_AT_ONCE] for group in groups for k in range(0, len(group), IMAGES_AT_ONCE)]
+    """Places in their order, some at a time and about as many each time, all of one placement of the board."""
+    batches: list[Batch] = []
+    for _, group in groupby(places, key=lambda place: place.placement):
+        own = list(group)
+        count = -(-len(own) // IMAGES_AT_ONCE)
+        if count >= LEAST_BATCHES:
+            count = -(-count // 4) * 4
+        cuts = [len(own) * k // count for k in range(count + 1)]
+        batches += [own[a:b] for a, b in pairwise(cuts) if b > a]
+    return batches
 
 
 def _find_stripes(
