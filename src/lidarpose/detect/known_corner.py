@@ -199,7 +199,8 @@ def _is_in_view(local: FloatArray, found: CornerCandidate, reference: CornerCand
     range_m = np.sqrt(np.einsum("ij,ij->i", local, local))
     mask = FaceMask(found.corner, found.normals, found.convex, (a, b, c), found.obstacles, MARGIN_M)
     directions = local / range_m[:, None]
-    _, met = mask.select(directions, range_m, np.inf)
-    _, on_face = mask.select(directions, range_m, 2.0 * GATE_SIGMAS * found.sigma_m)
+    towards, met = mask.select(directions, range_m, np.inf)
+    _, expected = mask.meet(directions[towards])
+    on_face = met[np.abs(range_m[towards] - expected) < 2.0 * GATE_SIGMAS * found.sigma_m]
     wanted, there = np.bincount(met, minlength=3), np.bincount(on_face, minlength=3)
     return bool((there >= SHARE * wanted).all() and (there >= FEWEST // 2).all())

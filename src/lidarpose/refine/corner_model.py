@@ -29,7 +29,8 @@ from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 TUKEY_K = 6.0
 MIN_SIGMA_M = 1e-6
 MAX_STEPS = 50
-SETTLED = 1e-3
+# The last step, in standard deviations; what is left after it is a tenth of it.
+SETTLED = 1e-2
 MIN_RETURNS = 3
 
 
@@ -296,7 +297,7 @@ def fit_corner_model(
         state = _moved(state, delta, options)
         residuals = np.concatenate([f.residual for f in faces])
         sigma_m = max(mad_sigma(residuals, centred=True), MIN_SIGMA_M)
-        if delta @ information @ delta < settled**2 and step > 2:
+        if delta @ information @ delta < settled**2 and step > 1:
             break
     information, _, systems = _assemble(faces, state, world, sigma_m, options)
     residuals = np.concatenate([f.residual for f in faces])

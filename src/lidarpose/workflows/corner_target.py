@@ -17,7 +17,7 @@ from lidarpose.detect.trihedral_corner import FaceMask, find_corners
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
-from lidarpose.model.corner_session import NEAR_RADIUS_M, CloudSource, CornerPlace, CornerSession
+from lidarpose.model.corner_session import NEAR_RADIUS_M, CornerPlace, CornerSession
 from lidarpose.model.observation import LeftOut
 from lidarpose.refine.corner_model import FreeCorner, direction_cells, face_residuals, fit_corner
 from lidarpose.solve.corner_matching import (
@@ -45,7 +45,7 @@ ODD_SPOT_SIGMAS = 1.75
 INNER_SHARE = 0.6
 INNER_STEPS, FIT_STEPS = 2, 5
 # A corner that moved by no more since its beams were selected selects the same ones.
-SETTLED_M = 5e-4
+SETTLED_M, INNER_SETTLED_M = 5e-4, 3e-3
 # What is cut out around the faces as sighted: the fitted corner may be this far from the sighted one.
 CROP_MARGIN_M = 0.15
 GOLDEN = 0.6180339887498949
@@ -333,34 +333,32 @@ def gather(session: CornerSession, found: FoundTarget, *, tick: Tick = lambda: N
     """Cut the target's surroundings from all frames of all places."""
     corners, radius = expected_corners(found), _crop_radius(found)
 
-    def crop(task: tuple[CloudSource, FloatArray, FloatArray]) -> FloatArray:
-        source, low, high = task
-        kept = _inside_box(source.load().points, low, high)
-        tick()
-        return kept
+    def crop(task: tuple[CornerPlace, FloatArray, CornerCandidate | None]) -> PlaceCrop:
+        place, corner, sighting = task
+        low, high = corner - radius, corner + radius
+        if sighting is not None:
+            outlines = np.concatenate(sighting.outlines)
+            low, high = outlines.min(axis=0) - CROP_MARGIN_M, outlines.max(axis=0) + CROP_MARGIN_M
+        parts = []
+        for source in place.clouds:
+            parts.append(_inside_box(source.load().points, low, high))
+            tick()
+        frame = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
+        return PlaceCrop(np.concatenate(parts, dtype=np.float64), frame, len(parts))
 
-    crops = []
     with ThreadPoolExecutor(2) as pool:
-        for place, corner, sighting in zip(session.places, corners, found.sightings, strict=True):
-            low, high = corner - radius, corner + radius
-            if sighting is not None:
-                outlines = np.concatenate(sighting.outlines)
-                low, high = outlines.min(axis=0) - CROP_MARGIN_M, outlines.max(axis=0) + CROP_MARGIN_M
-            parts = list(pool.map(crop, [(source, low, high) for source in place.clouds]))
-            frame = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
-            crops.append(PlaceCrop(np.concatenate(parts), frame, len(parts)))
-    return tuple(crops)
+        return tuple(pool.map(crop, zip(session.places, corners, found.sightings, strict=True)))
 
 
-def _inside_box(points: NDArray[np.floating], low: FloatArray, high: FloatArray) -> FloatArray:
+def _inside_box(points: NDArray[np.floating], low: FloatArray, high: FloatArray) -> NDArray[np.floating]:
     """Points (M, 3) in a box: most fall out by one coordinate alone, those without return too."""
-    few = points[:: max(len(points) // 1000, 1)]
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    # The farther the box lies out along an axis for its size, the fewer points share that coordinate.
     with np.errstate(invalid="ignore"):
-        axes = np.argsort(np.count_nonzero((few > low) & (few < high), axis=0))
-        for k in axes:
-            x = points[:, k]
-            points = points.take(np.flatnonzero((x > low[k]) & (x < high[k])), axis=0)
-    return points.astype(np.float64)
+        for k in np.argsort(-np.abs(middle) / half):
+            x = points[:, k] - points.dtype.type(middle[k])
+            points = points.take(np.flatnonzero(np.abs(x, out=x) < half[k]), axis=0)
+    return points
 
 
 def expected_corners(found: FoundTarget) -> FloatArray:
@@ -444,7 +442,7 @@ def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> Fre
                 return None
             last = step == FIT_STEPS - 1
             fit = fit_corner(faces, normals, corner, sigma_m, tolerance_m=1e-5 if last else 2e-4)
-            settled = bool(np.linalg.norm(fit.corner - corner) < SETTLED_M)
+            settled = bool(np.linalg.norm(fit.corner - corner) < (INNER_SETTLED_M if inner else SETTLED_M))
             corner, normals, sigma_m = fit.corner, fit.normals, fit.sigma_m
             gate_m = min(gate_m, max(GATE_SIGMAS * sigma_m, 0.002))
             if settled and not inner:

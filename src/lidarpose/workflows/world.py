@@ -57,7 +57,7 @@ WORLD_METHODS: tuple[WorldMethod, ...] = ("joint", "paper", "paper-approx", "ran
 JOINT_WHISKER = 3.0
 MIN_FRAMES_FOR_BOX_PLOT = 5
 # Returns around the target, of all frames of a place together, from which the first estimate is made.
-FIRST_RETURNS = 4000
+FIRST_RETURNS = 3000
 # That estimate's last step, in standard deviations.
 FIRST_SETTLED = 0.1
 SMALL_TURN_RAD = np.radians(3.0)
