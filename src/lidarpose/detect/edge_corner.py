@@ -22,10 +22,12 @@ from lidarpose.model.plane_patch import PlanePatch
 REACH_M, NEAR_M = 0.8, 0.12
 LEAST_SINE = 0.5
 LEAST_COMMON_M = 0.1
-FEWEST = 12
+FEWEST, FEWEST_THIRD = 12, 8
 ONE_SIDED = 0.9
 # Returns of the third face lie behind the other two by this, and so near to where those end.
 BEHIND_M, RISE_M = 0.02, 0.25
+# Sine of the angle by which the third face may lean against the plane square to the edge.
+MOST_LEAN = 0.35
 
 
 def find_edge_corners(
@@ -69,13 +71,16 @@ def _corner(
     spans = [np.quantile(m @ along, [0.02, 0.98]) for m in local]
     if min(s[1] for s in spans) - max(s[0] for s in spans) < LEAST_COMMON_M:
         return None
-    # The end that shows its face: the sensor is beyond it.
     low, high = min(s[0] for s in spans), max(s[1] for s in spans)
-    if low > 0.0:
-        along, high = -along, -low
-    elif high > 0.0:
-        return None
-    return _with_third_face(points, planes, local, foot + high * along, along, max(p.sigma_m for p in patches))
+    sigma_m = max(p.sigma_m for p in patches)
+    for direction, height in ((along, high), (-along, -low)):
+        end = foot + height * direction
+        # The end that shows its face: the sensor is beyond the face, which may lean against the edge.
+        if height < MOST_LEAN * np.linalg.norm(end):
+            candidate = _with_third_face(points, planes, local, end, direction, sigma_m)
+            if candidate is not None:
+                return candidate
+    return None
 
 
 def _beside(points: FloatArray, foot: FloatArray, along: FloatArray) -> FloatArray:
@@ -112,7 +117,7 @@ def _with_third_face(
         depth = -plane.distance(near)
         behind &= (depth > BEHIND_M) & (depth < reach)
     third = near[behind]
-    if len(third) < FEWEST:
+    if len(third) < FEWEST_THIRD:
         return None
     height = float(np.median(third @ along))
     corner = end + (height - float(end @ along)) * along

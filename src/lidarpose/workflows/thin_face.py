@@ -26,7 +26,7 @@ NEAR_M, GATE_M = 0.08, 0.03
 # Returns behind both of the other faces by this are of no other face; the third may rise or fall by so much.
 BEHIND_M, RISE_M = 0.02, 0.25
 BORDER_M = 0.05
-FEWEST = 12
+FEWEST, FEWEST_THIN = 12, 8
 START_SIGMA_M = 0.02
 # Ranges that scatter by more about the three planes are of something else.
 WORST_SIGMA_M = 0.02
@@ -34,13 +34,13 @@ WORST_SIGMA_M = 0.02
 
 @dataclass(frozen=True, eq=False)
 class _Edge:
-    """Two faces that were seen well, and the direction along their edge, out of the third: towards the sensor."""
+    """Two faces that were seen well, their outlines about the corner, and the direction along their edge, out of the
+    third: towards the sensor."""
 
     faces: tuple[int, int]
     thin: int
     normals: FloatArray
     outlines: tuple[FloatArray, FloatArray]
-    corner: FloatArray
     reach_m: float
 
     @property
@@ -95,10 +95,15 @@ def _edge(found: FoundTarget, crops: Sequence[PlaceCrop]) -> _Edge | None:
     along = np.cross(mean[i], mean[j])
     if np.linalg.norm(along) < 0.4:
         return None
-    along = unit(along if along @ reference.corner < 0.0 else -along)
-    outlines = (reference.outlines[i], reference.outlines[j])
-    reach = max(float(np.linalg.norm(o - reference.corner, axis=1).max()) for o in outlines)
-    return _Edge((i, j), thin, np.stack([mean[i], mean[j], along]), outlines, reference.corner, reach)
+    along = unit(along if along @ mean[thin] > 0.0 else -along)
+    # A single sighting may hold only a part of a face.
+    outlines = []
+    for k in (i, j):
+        plane = Plane(mean[k], 0.0)
+        relative = np.concatenate([s.outlines[k] - s.corner for s, _ in sighted])
+        outlines.append(convex_outline(plane.project(relative), plane))
+    reach = max(float(np.linalg.norm(o, axis=1).max()) for o in outlines)
+    return _Edge((i, j), thin, np.stack([mean[i], mean[j], along]), (outlines[0], outlines[1]), reach)
 
 
 def _counts(sighted: Sequence[tuple[CornerCandidate, PlaceCrop]]) -> FloatArray:
@@ -125,7 +130,7 @@ def _returns(crop: PlaceCrop, edge: _Edge, corner: FloatArray) -> _Seen | None:
     offsets, members = [], []
     for normal, outline in zip(edge.normals[:2], edge.outlines, strict=True):
         plane = Plane(normal, float(normal @ corner))
-        near = points[_over(points, plane, outline + corner - edge.corner, BORDER_M) < NEAR_M]
+        near = points[_over(points, plane, outline + corner, BORDER_M) < NEAR_M]
         if len(near) < FEWEST:
             return None
         heights = near @ normal
@@ -136,7 +141,7 @@ def _returns(crop: PlaceCrop, edge: _Edge, corner: FloatArray) -> _Seen | None:
     rise = (points - corner) @ edge.along
     behind = (first < -BEHIND_M) & (second < -BEHIND_M) & (np.abs(rise) < RISE_M)
     thin = points[behind & (np.linalg.norm(points - corner, axis=1) < edge.reach_m + BORDER_M)]
-    if len(thin) < FEWEST:
+    if len(thin) < FEWEST_THIN:
         return None
     return _Seen((members[0], members[1], thin), np.array(offsets))
 
