@@ -1,7 +1,7 @@
 """The corner at the end of an edge of two faces, where the third is no patch: seen by a scan line or two.
 
-Behind both planes of a convex edge, and at its end that shows itself to the sensor, only the third face can be seen.
-Its few returns tell how high it is, and the edge's direction stands for its normal.
+Behind both planes of a convex edge, or before both of a concave one, and at its end that shows itself to the sensor,
+only the third face can be seen. Its few returns tell how high it is, and the edge's direction stands for its normal.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MOST_LEAN = 0.35
 def find_edge_corners(
     points: NDArray[np.floating[Any]], patches: tuple[PlanePatch, ...]
 ) -> tuple[CornerCandidate, ...]:
-    """Corners at the visible ends of convex edges between two patches.
+    """Corners at the visible ends of edges between two patches.
 
     Parameters
     ----------
@@ -66,18 +66,23 @@ def _corner(
     along = unit(along)
     foot = np.linalg.solve([planes[0].normal, planes[1].normal, along], [planes[0].offset, planes[1].offset, 0.0])
     local = [_beside(m, foot, along) for m in members]
-    if min(len(m) for m in local) < FEWEST or not _is_convex(local, patches):
+    if min(len(m) for m in local) < FEWEST:
+        return None
+    sigma_m = max(p.sigma_m for p in patches)
+    side = _side(local, planes, 3.0 * sigma_m)
+    if side == 0.0:
         return None
     spans = [np.quantile(m @ along, [0.02, 0.98]) for m in local]
     if min(s[1] for s in spans) - max(s[0] for s in spans) < LEAST_COMMON_M:
         return None
     low, high = min(s[0] for s in spans), max(s[1] for s in spans)
-    sigma_m = max(p.sigma_m for p in patches)
-    for direction, height in ((along, high), (-along, -low)):
+    # A convex corner's other two faces lie below its third, a concave one's above it.
+    ends = ((along, high), (-along, -low)) if side < 0.0 else ((along, low), (-along, -high))
+    for direction, height in ends:
         end = foot + height * direction
         # The end that shows its face: the sensor is beyond the face, which may lean against the edge.
         if height < MOST_LEAN * np.linalg.norm(end):
-            candidate = _with_third_face(points, planes, local, end, direction, sigma_m)
+            candidate = _with_third_face(points, planes, local, end, direction, side, sigma_m)
             if candidate is not None:
                 return candidate
     return None
@@ -93,11 +98,13 @@ def _beside(points: FloatArray, foot: FloatArray, along: FloatArray) -> FloatArr
     return np.asarray(points[distance < REACH_M])
 
 
-def _is_convex(local: list[FloatArray], patches: tuple[PlanePatch, PlanePatch]) -> bool:
-    tolerance = 3.0 * max(p.sigma_m for p in patches)
-    return all(
-        bool(np.mean(patches[1 - k].plane.distance(points) < tolerance) >= ONE_SIDED) for k, points in enumerate(local)
-    )
+def _side(local: list[FloatArray], planes: list[Plane], tolerance: float) -> float:
+    """-1 if each face lies behind the other's plane, 1 if before it, 0 if neither."""
+    heights = [planes[1 - k].distance(points) for k, points in enumerate(local)]
+    for side in (-1.0, 1.0):
+        if all(float(np.mean(side * h > -tolerance)) >= ONE_SIDED for h in heights):
+            return side
+    return 0.0
 
 
 def _with_third_face(
@@ -106,15 +113,16 @@ def _with_third_face(
     local: list[FloatArray],
     end: FloatArray,
     along: FloatArray,
+    side: float,
     sigma_m: float,
 ) -> CornerCandidate | None:
     offset = points - end.astype(points.dtype)
     near = points[np.einsum("ij,ij->i", offset, offset) < REACH_M**2].astype(np.float64)
-    # No farther behind either plane than the other face reaches: beyond its far edge other things are seen.
-    far = [max(float(np.quantile(-planes[1 - k].distance(p), 0.98)), 0.1) for k, p in enumerate(local)]
+    # No farther from either plane than the other face reaches: beyond its far edge other things are seen.
+    far = [max(float(np.quantile(side * planes[1 - k].distance(p), 0.98)), 0.1) for k, p in enumerate(local)]
     behind = np.abs((near - end) @ along) < RISE_M
     for plane, reach in zip(planes, (far[1], far[0]), strict=True):
-        depth = -plane.distance(near)
+        depth = side * plane.distance(near)
         behind &= (depth > BEHIND_M) & (depth < reach)
     third = near[behind]
     if len(third) < FEWEST_THIRD:
@@ -128,7 +136,7 @@ def _with_third_face(
     return CornerCandidate(
         corner,
         np.stack([plane.normal for plane in faces]),
-        True,
+        side < 0.0,
         (outlines[0], outlines[1], outlines[2]),
         (),
         min(len(p) for p in local),

@@ -1,8 +1,8 @@
 """A target with a face that hardly a scan line meets, like the top of a box seen at a grazing angle by 16 lines.
 
 At a single place such a face has no plane of its own: what looks like one holds the line and the beams. But its returns
-are known by the other two faces, behind both of which nothing else can be seen, and the places together, seen at
-different heights, determine its plane: by the joint estimate, started from the edge of the other two faces.
+are known by the other two faces: behind both (of a concave corner before both) nothing else can be seen. And the places
+together, seen at different heights, determine its plane: by the joint estimate, started from the edge of the other two.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from lidarpose.workflows.corner_target import FoundTarget, PlaceCrop
 
 # A face's plane is looked for this near the sighting's, and its returns this near its plane.
 NEAR_M, GATE_M = 0.08, 0.03
-# Returns behind both of the other faces by this are of no other face; the third may rise or fall by so much.
+# Returns behind both of the other faces by this (before them, in a concave corner) are of no other face; the third may
+# rise or fall by so much.
 BEHIND_M, RISE_M = 0.02, 0.25
 BORDER_M = 0.05
 FEWEST, FEWEST_THIN = 12, 8
@@ -42,6 +43,7 @@ class _Edge:
     normals: FloatArray
     outlines: tuple[FloatArray, FloatArray]
     reach_m: float
+    convex: bool
 
     @property
     def along(self) -> FloatArray:
@@ -86,8 +88,6 @@ class _Seen:
 def _edge(found: FoundTarget, crops: Sequence[PlaceCrop]) -> _Edge | None:
     sighted = [(s, crop) for s, crop in zip(found.sightings, crops, strict=True) if s is not None]
     reference = max((s for s, _ in sighted), key=lambda s: s.support)
-    if not reference.convex:
-        return None
     # Of edges the third face is the thin one; else that of fewest returns.
     thin = 2 if found.by_edges else int(np.argmin(_counts(sighted)))
     i, j = (k for k in range(3) if k != thin)
@@ -103,7 +103,7 @@ def _edge(found: FoundTarget, crops: Sequence[PlaceCrop]) -> _Edge | None:
         relative = np.concatenate([s.outlines[k] - s.corner for s, _ in sighted])
         outlines.append(convex_outline(plane.project(relative), plane))
     reach = max(float(np.linalg.norm(o, axis=1).max()) for o in outlines)
-    return _Edge((i, j), thin, np.stack([mean[i], mean[j], along]), (outlines[0], outlines[1]), reach)
+    return _Edge((i, j), thin, np.stack([mean[i], mean[j], along]), (outlines[0], outlines[1]), reach, reference.convex)
 
 
 def _counts(sighted: Sequence[tuple[CornerCandidate, PlaceCrop]]) -> FloatArray:
@@ -139,7 +139,8 @@ def _returns(crop: PlaceCrop, edge: _Edge, corner: FloatArray) -> _Seen | None:
         offsets.append(middle)
     first, second = (points @ n - o for n, o in zip(edge.normals[:2], offsets, strict=True))
     rise = (points - corner) @ edge.along
-    behind = (first < -BEHIND_M) & (second < -BEHIND_M) & (np.abs(rise) < RISE_M)
+    side = -1.0 if edge.convex else 1.0
+    behind = (side * first > BEHIND_M) & (side * second > BEHIND_M) & (np.abs(rise) < RISE_M)
     thin = points[behind & (np.linalg.norm(points - corner, axis=1) < edge.reach_m + BORDER_M)]
     if len(thin) < FEWEST_THIN:
         return None
@@ -210,7 +211,7 @@ def _mended(found: FoundTarget, edge: _Edge, fit: CornerFit, seen: dict[int, _Se
         a, b, c = (outline + own[place] for outline in outlines)
         support = min(len(points) for points in s.points)
         sightings[place] = CornerCandidate(
-            own[place], state.normals, True, (a, b, c), standing, support, 0.5 * fit.range_sigma_m
+            own[place], state.normals, edge.convex, (a, b, c), standing, support, 0.5 * fit.range_sigma_m
         )
     match = replace(found.match, T_world_lidar=state.T_world_lidar)
     strays = {place: words for place, words in found.strays.items() if place not in seen}
