@@ -304,7 +304,7 @@ def _harvest(x: Float32Array, free: BoolArray, sample: _Sample, least: int, at_m
     least_sample = max(least / scale, 12.0)
     dead = np.zeros(len(sample.planes), dtype=bool)
     while len(patches) < at_most and not dead.all():
-        votes = sample.near @ active
+        votes = np.einsum("hs,s->h", sample.near, active)
         votes[dead] = -1.0
         if votes.max() < least_sample:
             break

@@ -25,7 +25,8 @@ from lidarpose.model.plane_patch import PlanePatch
 Float32Array = NDArray[np.float32]
 
 # Points of a block: its coordinates, heights and masks stay in a core's cache, and its matrix products are too small
-# for BLAS to share out among threads, which these blocks already keep busy.
+# for OpenBLAS to share out among threads, which these blocks already keep busy: two slabs at once are, a single one
+# would not be, as products with a vector have another limit.
 BLOCK = 32_000
 SLABS_AT_ONCE = 2
 GATE_SIGMAS = 3.0
@@ -135,7 +136,8 @@ class _Claims:
         rim = self.terms.take(off, axis=1)[_ON_PLANE]
         inside = apart < np.float32(GATE_SIGMAS * sigma_m)
         inside &= self.held
-        return (self.terms * inside.astype(np.float32)) @ self.terms.T, rim @ rim.T
+        # A copy: for an array times itself NumPy asks BLAS for a product that it does share out, however small.
+        return (self.terms * inside.astype(np.float32)) @ self.terms.T, rim.copy() @ rim.T
 
 
 _Part = tuple[_Claims, FloatArray, FloatArray]
@@ -210,11 +212,13 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
     points = np.empty((4, block.stop - block.start), dtype=np.float32)
     np.copyto(points[:3], x[block].T, casting="same_kind")
     points[3] = 1.0
-    rows = np.array([s.rows[1] / (CLAIM_SIGMAS * s.sigma_m) for s in slabs], dtype=np.float32)
-    height = np.empty((len(slabs), points.shape[1]), dtype=np.float32)
+    rows = np.zeros((-(-len(slabs) // SLABS_AT_ONCE) * SLABS_AT_ONCE, 4), dtype=np.float32)
+    rows[: len(slabs)] = [s.rows[1] / (CLAIM_SIGMAS * s.sigma_m) for s in slabs]
+    height = np.empty((len(rows), points.shape[1]), dtype=np.float32)
     for first in range(0, len(slabs), SLABS_AT_ONCE):
         some = slice(first, first + SLABS_AT_ONCE)
         np.matmul(rows[some], points, out=height[some])
+    height = height[: len(slabs)]
     near = np.abs(height, out=height) < np.float32(1.0)
     if free is not None:
         near &= free[block]
@@ -224,9 +228,9 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
     found = []
     for slab, mine in zip(slabs, near, strict=True):
         indices = np.flatnonzero(mine)
-        terms = slab.rows.astype(np.float32) @ points.take(indices, axis=1)
-        held = slab.holds(terms[4:])
-        terms = terms[:4]
+        to_slab = slab.rows.astype(np.float32)
+        few = points.take(indices, axis=1)
+        terms, held = to_slab[:4] @ few, slab.holds(to_slab[4:] @ few)
         if np.count_nonzero(held) < 0.5 * len(held):
             indices, terms = indices[held], terms.compress(held, axis=1)
             held = np.ones(len(indices), dtype=bool)
@@ -305,8 +309,13 @@ def _newton_step(plain: FloatArray, rim: FloatArray, gradient: FloatArray) -> Fl
 
 
 def _rest(terms: Float32Array, lean: FloatArray) -> Float32Array:
-    """Heights over the leant plane."""
-    return np.array([-lean[0], 1.0, -lean[1], -lean[2]], dtype=np.float32) @ terms
+    """Heights over the leant plane; not by BLAS, which would share out so short a product among all cores."""
+    at, along_u, along_v = lean.astype(np.float32)
+    rest: Float32Array = terms[2] * -along_u
+    rest -= terms[3] * along_v
+    rest -= at
+    rest += terms[1]
+    return rest
 
 
 def _members(block: slice, parts: Sequence[_Part], fits: Sequence[_Fit | None]) -> list[IntArray]:
