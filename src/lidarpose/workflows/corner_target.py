@@ -67,6 +67,8 @@ class FoundTarget:
         By place without a sighting: what stands there instead, for the user.
     by_edges
         The sightings are of two faces; the third's normal is but the direction of their edge.
+    by_motion
+        Each sighting's planes were fitted at its place to all that a frame has of the faces; none is turned far.
     """
 
     sightings: tuple[CornerCandidate | None, ...]
@@ -76,6 +78,7 @@ class FoundTarget:
     ambiguous: bool
     strays: Mapping[int, str] = field(default_factory=dict)
     by_edges: bool = False
+    by_motion: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +168,7 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
             tick()
         match = match_of(quick, world)
         if match is not None:
-            return FoundTarget(tuple(quick), match, world, "", False)
+            return FoundTarget(tuple(quick), match, world, "", False, by_motion=True)
 
     def corners_at(place: CornerPlace) -> tuple[CornerCandidate, ...]:
         found = place_corners(place, seed)

@@ -233,10 +233,11 @@ def _joint(
     mended = _usable_world(session, found)
     # First from a part of the returns, which tells where the faces are to a fraction of what all of them will.
     few = [crop.thinned(FIRST_RETURNS) for crop in crops]
-    # A face that single places do not determine leads their own fits astray.
-    fits = _place_fits(session, found, few) if own_fits else [None] * len(few)
+    # A face that single places do not determine leads their own fits astray; and good sightings are as good a start.
+    alone = own_fits and not found.by_motion
+    fits = _place_fits(session, found, few) if alone else [None] * len(few)
     start, sigma_m = _start(mended, found, fits)
-    corners = _corners(start, fits, found)
+    corners = _corners(start, fits, found, sighted=not alone)
     places, _ = observe(mended, found, few, corners, start.normals, sigma_m)
     fit, _ = _fit(mended, places, start, sigma_m, scale_too, FIRST_SETTLED)
     # Then from all, with the faces' beams selected by the estimate itself.
@@ -346,9 +347,15 @@ def _start(session: CornerSession, found: FoundTarget, fits: Sequence[FreeCorner
     return CornerState(pose, common, 1.0, errors), float(np.median(sigmas))
 
 
-def _corners(start: CornerState, fits: Sequence[FreeCorner | None], found: FoundTarget) -> FloatArray:
-    predicted = start.corners(found.world)
-    return np.stack([p if f is None else f.corner for f, p in zip(fits, predicted, strict=True)])
+def _corners(start: CornerState, fits: Sequence[FreeCorner | None], found: FoundTarget, *, sighted: bool) -> FloatArray:
+    """Each place's corner (P, 3): by its own fit, or as sighted where sightings stand for fits, or as predicted."""
+    corners = start.corners(found.world)
+    for k, (fit, sighting) in enumerate(zip(fits, found.sightings, strict=True)):
+        if fit is not None:
+            corners[k] = fit.corner
+        elif sighted and sighting is not None:
+            corners[k] = sighting.corner
+    return corners
 
 
 def _without_odd_frames(
