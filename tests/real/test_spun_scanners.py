@@ -15,7 +15,7 @@ from lidarpose.model.recording import SweepRecording
 from lidarpose.model.spun_scan import MountingRun
 from lidarpose.refine.mounting import MountingOptions
 from lidarpose.storage.clouds import read_cloud
-from lidarpose.workflows.self_calibration import axis_in_fan, calibrate_by_flatness
+from lidarpose.workflows.self_calibration import axis_in_fan, calibrate_by_flatness, recording_of_cloud
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 
@@ -28,20 +28,11 @@ def folder(name: str) -> Path:
 
 
 def room() -> SweepRecording:
-    """The cloud's points hold angles and ranges exactly: sweeps of one azimuth, beams about 0.97 degrees apart."""
-    points = read_cloud(folder("rot2d_pcl") / "room_scan1.pcd").finite().points.astype(np.float64)
-    ranges = np.linalg.norm(points, axis=1)
-    azimuth, elevation = np.arctan2(points[:, 1], points[:, 0]), np.arcsin(points[:, 2] / ranges)
-    step = float(np.median(-np.diff(elevation)))
-    beam = np.round((elevation.max() - elevation) / step).astype(np.int64)
-    # A new sweep begins where the elevation jumps up again.
-    sweep = np.concatenate([[0], np.cumsum(np.diff(elevation) > 0.5)])
-    table = np.full((sweep[-1] + 1, beam.max() + 1), np.nan)
-    table[sweep, beam] = ranges
-    readings = np.array([np.median(azimuth[sweep == k]) for k in range(len(table))])
-    beams = elevation.max() - step * np.arange(table.shape[1])
-    np.testing.assert_allclose(beams[beam], elevation, atol=2e-4)
-    return SweepRecording("rot2d_pcl", np.degrees(readings), np.degrees(beams), table)
+    """The file holds each point twice; the points hold angles and ranges exactly."""
+    cloud = read_cloud(folder("rot2d_pcl") / "room_scan1.pcd")
+    recording = recording_of_cloud(cloud, np.pi / 2.0, "rot2d_pcl")
+    assert 2 * np.count_nonzero(recording.has_return()) == pytest.approx(len(cloud), rel=0.03)
+    return recording
 
 
 def corridor() -> SweepRecording:

@@ -15,12 +15,15 @@ from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose, exp_so3, log_so3
 from lidarpose.model.beam_correction import BeamCorrection
 from lidarpose.model.calibration import TurntableCalibration
+from lidarpose.model.cloud import Cloud
+from lidarpose.model.recording import SweepRecording
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.simulate.surfaces import Sheet
 from lidarpose.storage.calibration import read_turntable_calibration, write_calibration
-from lidarpose.storage.recording import write_recording
+from lidarpose.storage.clouds import write_cloud
+from lidarpose.storage.recording import read_recording, write_recording
 from lidarpose.workflows.scanning import assemble_scan
-from lidarpose.workflows.self_calibration import axis_in_fan, calibrate_by_flatness
+from lidarpose.workflows.self_calibration import axis_in_fan, calibrate_by_flatness, recording_of_cloud
 from tests_support.rooms import ROOM, flat, mounting, sweep_room
 
 UP, SIDE = axis_in_fan(np.pi / 2.0), axis_in_fan(0.0)
@@ -154,3 +157,42 @@ def test_corrections_of_beams_survive_the_file_and_are_applied(tmp_path: Path) -
     (expected,) = assemble_scan(recording, calibration, points_per_part=10**9)
     (found,) = assemble_scan(wrong, again, points_per_part=10**9)
     np.testing.assert_allclose(found.points, expected.points, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["half a fan, a full turn", "a whole fan, half a turn"])
+def test_a_cloud_made_as_if_all_were_ideal_comes_out_straight(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start, readings, beams = RIGS[name]
+    truth = mounting((1.5, -1.2), (0.02, -0.01), start)
+    recording = sweep_room(truth, readings, beams, seed=4)
+    ideal = TurntableCalibration(TurntableMotion(Pose.identity(), start))
+    (cloud,) = assemble_scan(recording, ideal, points_per_part=10**9)
+    twice = replace(cloud, points=np.concatenate([cloud.points, cloud.points[::3]]), fields={})
+    write_cloud(tmp_path / "room.ply", twice)
+    call = ["import", str(tmp_path / "room.ply"), str(tmp_path / "back"), "--axis-beam-deg", "90"]
+    assert run([*call, "--half-turn"] if "whole" in name else call) == 0
+    back = read_recording(tmp_path / "back")
+    assert abs(back.sweeps - len(readings)) <= 1
+    assert np.count_nonzero(back.has_return()) == pytest.approx(len(cloud), rel=0.015)
+    found = calibrate_by_flatness(back, axis_in_fan(np.pi / 2.0)).estimate
+    assert np.degrees(np.arccos(found.T_table_lidar.rotation[2] @ truth.rotation[2])) < 0.1
+    assert found.quality.verdict == "good"
+
+
+def test_a_cloud_of_something_else_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_cloud(tmp_path / "else.ply", Cloud(np.random.default_rng(0).normal(size=(500, 3))))
+    assert run(["import", str(tmp_path / "else.ply"), str(tmp_path / "none"), "--axis-beam-deg", "90"]) == 1
+    assert "fan of beams" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
+def test_repeated_sweeps_of_a_cloud_stay_apart() -> None:
+    rng = np.random.default_rng(6)
+    readings, beams = np.repeat(np.arange(0.0, 90.0, 5.0), 2), np.arange(-60.0, 60.0, 4.0)
+    recording = SweepRecording("twice", readings, beams, rng.uniform(1.0, 2.0, (len(readings), len(beams))))
+    calibration = TurntableCalibration(TurntableMotion(Pose.identity(), UP))
+    (cloud,) = assemble_scan(recording, calibration, points_per_part=10**9)
+    back = recording_of_cloud(cloud, np.pi / 2.0, "back")
+    np.testing.assert_allclose(back.turntable_angle_deg, readings, atol=1e-3)
+    np.testing.assert_allclose(np.sort(back.range_m, axis=None), np.sort(recording.range_m, axis=None), atol=1e-5)

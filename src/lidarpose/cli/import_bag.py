@@ -1,4 +1,4 @@
-"""``lidarpose import``: a ROS bag or a LiDAR's packets as a recording or session."""
+"""``lidarpose import``: a ROS bag, a LiDAR's packets or a spun LiDAR's cloud as a recording or session."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from lidarpose.cli.options import FiniteFloat, PositiveFloat
 
 if TYPE_CHECKING:
+    from lidarpose.model.scan import LidarSpec
     from lidarpose.model.targets import Panel
 
 
@@ -33,18 +34,21 @@ def import_bag(
     cloud_topic: str | None = None,
     place: str | None = None,
     world_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat] | None = None,
+    axis_beam_deg: FiniteFloat | None = None,
+    half_turn: Annotated[bool, Parameter(negative=(), show_default=False)] = False,
     lidar_model: str | None = None,
     range_sigma_m: PositiveFloat | None = None,
 ) -> None:
     """Make a recording or session of a ROS bag (ROS 1, ROS 2 sqlite3 or MCAP) or of Velodyne packets (.pcap).
 
     Scans and the turntable's angle make a sweep recording; with images and --panel, a turntable session; clouds are
-    added to a corner session as one place. Topics are found by their type.
+    added to a corner session as one place. Topics are found by their type. With --axis-beam-deg, the cloud of a spun
+    2D LiDAR becomes the recording that it was made of.
 
     Parameters
     ----------
     bag
-        A .bag, .db3 or .mcap file, the folder of a ROS 2 bag, or a .pcap file.
+        A .bag, .db3 or .mcap file, the folder of a ROS 2 bag, a .pcap file, or a cloud.
     out
         The folder to make.
     as_
@@ -77,6 +81,12 @@ def import_bag(
         The name of the target's place in a corner session.
     world_m
         The corner's world coordinates at this place.
+    axis_beam_deg
+        For a cloud that was put together as if the LiDAR sat on the axis and its fan of beams held it: the beam angle
+        that is to point along the axis, the cloud's z. `calibrate` then finds how the LiDAR really sat.
+    half_turn
+        The table of that cloud turned from 0 to 180 degrees, and the fan saw to both sides. Otherwise each beam is
+        taken to have been on the side of the cloud's x at reading 0.
     lidar_model
         The LiDAR's name, for the recording.
     range_sigma_m
@@ -90,6 +100,10 @@ def import_bag(
     from lidarpose.storage.cloud_import import PlaceOptions
     from lidarpose.storage.packets import import_packets
 
+    if axis_beam_deg is not None:
+        summary = _import_cloud(bag, out, axis_beam_deg, half_turn, LidarSpec(lidar_model, range_sigma_m))
+        console().print(f"{out} (recording): {summary}", markup=False, soft_wrap=True)
+        return
     where = PlaceOptions(place, world_m)
     if bag.suffix.lower() == ".pcap":
         report = import_packets(bag, out, where)
@@ -115,6 +129,22 @@ def import_bag(
     for remark in report.remarks:
         err().print(remark, markup=False, soft_wrap=True)
     console().print(f"{out} ({report.kind}): {report.summary}", markup=False, soft_wrap=True)
+
+
+def _import_cloud(cloud: Path, out: Path, axis_beam_deg: float, half_turn: bool, lidar: LidarSpec) -> str:
+    import math
+    from dataclasses import replace
+
+    from lidarpose.storage.atomic import require_new_folder
+    from lidarpose.storage.clouds import read_cloud
+    from lidarpose.storage.recording import write_recording
+    from lidarpose.workflows.self_calibration import recording_of_cloud
+
+    require_new_folder(out)
+    angle = math.radians(axis_beam_deg)
+    recording = recording_of_cloud(read_cloud(cloud), angle, cloud.name, half_turn=half_turn)
+    write_recording(out, replace(recording, lidar=lidar))
+    return f"{recording.sweeps} sweeps of {recording.beams} beams"
 
 
 def _panel(text: str) -> Panel:

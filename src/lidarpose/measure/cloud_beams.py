@@ -18,6 +18,8 @@ from lidarpose.model.turntable import TurntableMotion
 _MOST_CELLS = 40_000_000
 # A cloud's coordinates are float32: angles of one beam agree to this.
 _SAME_ANGLE_RAD = 2e-5
+# Sine of the angle to the axis below which the turn about it is lost in rounding.
+_ON_AXIS = 5e-3
 
 
 def recording_from_cloud(
@@ -46,8 +48,28 @@ def recording_from_cloud(
     return best
 
 
+def recording_of_ideal_cloud(
+    points: FloatArray, motion: TurntableMotion, light: FloatArray | None = None, *, half_turn: bool = False
+) -> SweepRecording | None:
+    """The recording of a cloud that was put together with a LiDAR on the axis, whose fan holds it; None if it was not.
+
+    A point behind the axis may be one of a beam before the LiDAR half a turn on. With `half_turn` the table is taken to
+    have turned from 0 to 180 degrees, with beams to both sides; without, beams go to the side of the table's x alone.
+    Points of one beam at one reading become sweeps of their own, and copies of a point are dropped.
+    """
+    q = motion.T_camera_turntable.inverse() @ points
+    # On the axis a point tells no reading.
+    told = np.hypot(q[:, 0], q[:, 1]) > _ON_AXIS * np.linalg.norm(q, axis=1)
+    q, light = q[told], None if light is None else light[told]
+    psi = np.arctan2(q[:, 1], q[:, 0])
+    if half_turn:
+        psi = np.where(psi < -_SAME_ANGLE_RAD, psi + np.pi, psi)
+        psi = np.where(psi > np.pi - _SAME_ANGLE_RAD, psi - np.pi, psi)
+    return _gridded(q, psi, motion, light, repeated=True)
+
+
 def _gridded(
-    q: FloatArray, psi: FloatArray, motion: TurntableMotion, light: FloatArray | None
+    q: FloatArray, psi: FloatArray, motion: TurntableMotion, light: FloatArray | None, *, repeated: bool = False
 ) -> SweepRecording | None:
     c, s = np.cos(psi), np.sin(psi)
     at_zero = np.column_stack([c * q[:, 0] + s * q[:, 1], -s * q[:, 0] + c * q[:, 1], q[:, 2]])
@@ -55,19 +77,36 @@ def _gridded(
     theta, r = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])
     psi_levels, i = _levels(psi)
     theta_levels, j = _levels(theta)
+    if repeated:
+        keep, i, readings = _told_apart(i, j, r.astype(np.float32))
+        psi_levels, j, r, light = psi_levels[readings], j[keep], r[keep], None if light is None else light[keep]
     cells = len(psi_levels) * len(theta_levels)
-    if cells > _MOST_CELLS or cells > 50 * len(q) or min(len(psi_levels), len(theta_levels)) < 8:
+    if cells > _MOST_CELLS or cells > 50 * len(r) or min(len(psi_levels), len(theta_levels)) < 8:
         return None
     ranges = np.full((len(psi_levels), len(theta_levels)), np.nan, dtype=np.float32)
     ranges[i, j] = r
     # Two points of one beam: this is not how the cloud came about.
-    if np.count_nonzero(np.isfinite(ranges)) < 0.99 * len(q):
+    if np.count_nonzero(np.isfinite(ranges)) < 0.99 * len(r):
         return None
     intensity = None
     if light is not None:
         intensity = np.zeros(ranges.shape, dtype=np.float32)
         intensity[i, j] = light
     return SweepRecording("cloud", np.rad2deg(psi_levels), np.rad2deg(theta_levels), ranges, intensity)
+
+
+def _told_apart(i: IntArray, j: IntArray, r: NDArray[np.float32]) -> tuple[IntArray, IntArray, IntArray]:
+    """Which points to keep (k,), the sweep (k,) of each, and each sweep's reading, where beams were sent repeatedly."""
+    # Copies of a point hold nothing new.
+    keep = np.sort(np.unique(np.stack([i, j, r.view(np.int32)], axis=1), axis=0, return_index=True)[1])
+    i, j = i[keep], j[keep]
+    order = np.lexsort((keep, j, i))
+    new = np.concatenate([[True], (np.diff(i[order]) != 0) | (np.diff(j[order]) != 0)])
+    since = np.arange(len(order)) - np.maximum.accumulate(np.where(new, np.arange(len(order)), 0))
+    turn = np.empty(len(order), dtype=np.int64)
+    turn[order] = since
+    sweeps, sweep = np.unique(np.stack([i, turn], axis=1), axis=0, return_inverse=True)
+    return keep, np.asarray(sweep, dtype=np.int64).reshape(-1), sweeps[:, 0]
 
 
 def _levels(angle: FloatArray) -> tuple[FloatArray, IntArray]:

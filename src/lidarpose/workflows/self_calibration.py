@@ -6,8 +6,8 @@ and tell more.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,12 @@ from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.se3 import Pose
+from lidarpose.measure.cloud_beams import recording_of_ideal_cloud
+from lidarpose.model.cloud import Cloud
 from lidarpose.model.plane_patch import PlanePatch
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.spun_scan import FlatReturns, MountingEstimate, MountingRun
+from lidarpose.model.turntable import TurntableMotion
 from lidarpose.refine.flatness import EXTRA_NAMES, points_in_table
 from lidarpose.refine.mounting import MountingOptions, mounting_calibration, refine_mounting
 
@@ -42,6 +45,31 @@ def axis_in_fan(axis_beam_rad: float) -> Pose:
     # The beam a right angle behind the axis' one points along the table's x.
     x = np.array([s, -c, 0.0])
     return Pose(np.stack([x, np.cross(z, x), z]), np.zeros(3))
+
+
+def recording_of_cloud(cloud: Cloud, axis_beam_rad: float, name: str, *, half_turn: bool = False) -> SweepRecording:
+    """The recording behind a cloud that was put together as if the LiDAR sat as in `axis_in_fan`.
+
+    With `half_turn` it turned by half a turn and saw to both sides; without, it saw to one side only.
+
+    Raises
+    ------
+    UndeterminedError
+        If the points are not those of a fan of beams that turns about z.
+    """
+    whole = cloud.finite()
+    points = whole.points.astype(np.float64)
+    light = whole.fields.get("intensity")
+    away = np.linalg.norm(points, axis=1) > 0.0
+    motion = TurntableMotion(Pose.identity(), axis_in_fan(axis_beam_rad))
+    light = None if light is None else np.asarray(light, dtype=np.float64)[away]
+    found = recording_of_ideal_cloud(points[away], motion, light, half_turn=half_turn) if away.any() else None
+    if found is None:
+        raise UndeterminedError(
+            "The cloud's points are not those of one fan of beams that turns about z",
+            remedy="Give the cloud as the scanner's own software made it, neither moved nor thinned, or the recording.",
+        )
+    return replace(found, name=name)
 
 
 def calibrate_by_flatness(
@@ -89,7 +117,7 @@ def calibrate_by_flatness(
             estimate = _unsettled(estimate)
             break
         before = now
-    calibration = dataclasses.replace(mounting_calibration(estimate), provenance=dict(provenance or {}))
+    calibration = replace(mounting_calibration(estimate), provenance=dict(provenance or {}))
     return MountingRun(calibration, estimate, len(returns), rounds)
 
 
@@ -150,8 +178,8 @@ def _moved(change: FloatArray, estimate: MountingEstimate, start: Pose) -> float
 def _unsettled(estimate: MountingEstimate) -> MountingEstimate:
     quality = estimate.quality
     reason = "surfaces and mounting did not settle on each other: what is found flat changes with the mounting"
-    return dataclasses.replace(
+    return replace(
         estimate,
         converged=False,
-        quality=dataclasses.replace(quality, verdict="doubtful", reasons=(*quality.reasons, reason)),
+        quality=replace(quality, verdict="doubtful", reasons=(*quality.reasons, reason)),
     )
