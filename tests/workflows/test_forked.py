@@ -154,6 +154,15 @@ def test_a_system_that_forks_no_more_costs_time_only() -> None:
     """)
 
 
+def test_a_container_without_files_in_memory_gets_no_copies() -> None:
+    run("""
+    def refuse(name):
+        raise PermissionError(1, "Operation not permitted")
+    os.memfd_create = refuse
+    assert copies_allowed() == 0
+    """)
+
+
 @TWO_CORES
 def test_no_copies_beside_threads_or_on_one_core() -> None:
     run("""
