@@ -31,3 +31,10 @@ def rms(rows: Sequence[FloatArray] | FloatArray) -> FloatArray:
     if len(values) == 0:
         return np.full(values.shape[1:], np.nan)
     return np.asarray(np.sqrt((values**2).mean(axis=0)))
+
+
+def by_chance(runs: int) -> str:
+    """How sure a root mean square of so many runs is, at the worst: one direction that dominates all errors."""
+    return (
+        f"by chance alone, within {100.0 / np.sqrt(2.0 * max(runs, 1)):.0f} % of its true value two times out of three"
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.accuracy_world import bound
 from benchmarks.peers.corner_peers import open3d_corners, registered_places
 from benchmarks.report import Curve, Effort, Report, Table
-from benchmarks.studies import in_processes, rms
+from benchmarks.studies import by_chance, in_processes, rms
 from lidarpose.errors import LidarposeError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose
@@ -26,16 +26,19 @@ METHODS = (*OWN, OPEN3D, ICP)
 
 @dataclass(frozen=True)
 class Setting:
-    """One point of a curve: frames a place, range noise, places."""
+    """One point of a curve: frames a place, range noise, places, edge of the cube."""
 
     frames: int = 1
     range_sigma_m: float = 0.008
     places: int = 6
+    size_m: float = 0.5
 
     def spec(self, seed: int) -> CornerSceneSpec:
         """Pose 1 of the paper with its cube before an HDL-32."""
         defects = replace(Defects(), range_sigma_m=self.range_sigma_m)
-        return CornerSceneSpec(pose="1", frames=self.frames, places=self.places, seed=seed, defects=defects)
+        return CornerSceneSpec(
+            pose="1", frames=self.frames, places=self.places, seed=seed, size_m=self.size_m, defects=defects
+        )
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,8 @@ AXES = (
     _Axis("frames", "frames a place", (1, 2, 5, 20), lambda v: Setting(frames=int(v))),
     _Axis("noise", "range noise, mm", (2, 4, 8, 16), lambda v: Setting(range_sigma_m=1e-3 * v)),
     _Axis("places", "places", (3, 4, 6, 10), lambda v: Setting(places=int(v))),
+    # By how much a smaller target is as one farther off: the simulator's stand 1.4 to 2.6 m away.
+    _Axis("size", "edge of the cube, m (1.4 to 2.6 m away)", (0.3, 0.4, 0.5, 0.7), lambda v: Setting(size_m=v)),
 )
 
 
@@ -134,7 +139,8 @@ def _table(studied: _Studied) -> Table:
             rows.append([method, *e, *(e / studied.bound), f"{n} of {studied.runs}"])
     rows.append(["Cramer-Rao bound", *studied.bound, 1, 1, ""])
     columns = ["method", "deg RMS", "mm RMS", "deg over the bound", "mm over it", "answers"]
-    return Table("Methods for the world pose, one frame a place", columns, rows, _TEXT)
+    chance = f"{studied.runs} runs: {by_chance(studied.runs)}."
+    return Table("Methods for the world pose, one frame a place", columns, rows, f"{_TEXT} {chance}")
 
 
 _TEXT = " ".join(
@@ -152,6 +158,7 @@ def _curve(axis: _Axis, studied: dict[Setting, _Studied]) -> Curve:
         m: [float(s.over_bound(m)[1]) for s in settings] for m in METHODS if any(len(s.errors[m]) for s in settings)
     }
     absolute = ", ".join(f"{s.bound[1]:.3g}" for s in settings)
-    text = f"Position, RMS of {min(s.runs for s in settings)} runs or more. The bound itself, in mm: {absolute}."
+    runs = min(s.runs for s in settings)
+    text = f"Position, RMS of {runs} runs or more ({by_chance(runs)}). The bound itself, in mm: {absolute}."
     title = f"Methods for the world pose over {axis.label}"
     return Curve(f"corner-{axis.name}", title, axis.label, "error over the bound", axis.values, series, text)

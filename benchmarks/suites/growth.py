@@ -19,6 +19,7 @@ SIZES = {
     "assembled": (1_000_000, 4_000_000, 16_000_000),
     "written": (300_000, 1_500_000, 7_500_000),
 }
+LEAST_MB = 1.0
 WORK = {
     "places": "`calibrate`, turntable, places",
     "frames": "`calibrate`, world, frames",
@@ -52,9 +53,9 @@ def run(effort: Effort) -> Report:
         both = exponent(values, seconds), exponent(values, memory)
         if name in ("places", "frames", "points"):
             figures |= {f"growth.{name}_s": both[0], f"growth.{name}_mb": both[1]}
-        rows.append(
-            [WORK[name], f"{values[0]} to {values[-1]}", seconds[-1], f"{both[0]:.2f}", memory[-1], f"{both[1]:.2f}"]
-        )
+        # Of next to nothing an exponent says nothing.
+        of_memory = f"{both[1]:.2f}" if memory[-1] > LEAST_MB else "-"
+        rows.append([WORK[name], f"{values[0]} to {values[-1]}", seconds[-1], f"{both[0]:.2f}", memory[-1], of_memory])
         curves.append(
             Curve(
                 f"growth-{name}",

@@ -17,7 +17,7 @@ from benchmarks.peers.plane_views import PlaneView, views_by_reading
 from benchmarks.peers.rigid_methods import dong_isler, guo_roumeliotis, zhang_pless, zhang_pless_linear
 from benchmarks.peers.turning_methods import circle_of_poses, points_on_planes
 from benchmarks.report import Curve, Effort, Report, Table
-from benchmarks.studies import in_processes, rms
+from benchmarks.studies import by_chance, in_processes, rms
 from lidarpose.errors import LidarposeError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose
@@ -262,7 +262,8 @@ def _table(studied: _Studied) -> Table:
     for name, limit in (("Cramer-Rao bound", studied.bound), (WITHOUT_STRIPE, studied.without_stripe)):
         rows.append([name, *limit, limit[0] / studied.bound[0], limit[1] / studied.bound[1], ""])
     columns = ["method", "mm", "deg", "mm, half a turn away", "deg", "mm over the bound", "deg over it", "runs"]
-    return Table("Methods for the turntable", columns, rows, _TEXT)
+    runs = len(studied.errors[JOINT])
+    return Table("Methods for the turntable", columns, rows, f"{_TEXT} {runs} runs: {by_chance(runs)}.")
 
 
 _TEXT = " ".join(
@@ -281,7 +282,7 @@ _TEXT = " ".join(
 def _curve(axis: _Axis, studied: dict[Setting, _Studied], runs: int) -> Curve:
     settings = [studied[axis.setting(value)] for value in axis.values]
     series = {m: [s.ratio(m) for s in settings] for m in (*METHODS, WITHOUT_STRIPE)}
-    text = f"Centre in the middle of the arc, RMS of {runs} runs or more; 1 is the Cramer-Rao bound there."
+    text = f"Centre in the middle of the arc, RMS of {runs} runs or more; 1 is the Cramer-Rao bound there"
     absolute = ", ".join(f"{s.bound[0]:.3g}" for s in settings)
     return Curve(
         f"turntable-{axis.name}",
@@ -290,5 +291,5 @@ def _curve(axis: _Axis, studied: dict[Setting, _Studied], runs: int) -> Curve:
         "error over the bound",
         axis.values,
         series,
-        f"{text} The bound itself, in mm: {absolute}.",
+        f"{text} ({by_chance(runs)}). The bound itself, in mm: {absolute}.",
     )
