@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,21 +29,32 @@ class NormalEquations:
         return np.asarray(scale * np.linalg.lstsq(scaled, scale * self.gradient, rcond=1e-14)[0])
 
 
-def line_moments(
-    basis: FloatArray, along: FloatArray, residual: FloatArray, weight: FloatArray, start: IntArray
-) -> FloatArray:
-    """Weighted second moments (S, b + 3, b + 3) of (basis, 1, sqrt(3) along, residual), one matrix a line.
+def line_columns(basis: Sequence[FloatArray], along: FloatArray, residual: FloatArray) -> FloatArray:
+    """Columns (N, b + 3): the b of the basis (N,), 1, sqrt(3) along (N,), residual (N,).
 
-    `basis` (N, b), `along`, `residual`, `weight` (N,); `start` (S + 1,) tells where lines begin. The two columns before
-    the residual are what a line may be off by as a whole: a shift and a slope, both of mean square 1.
+    The two before the residual are what a line may be off by as a whole: a shift and a slope, both of mean square 1.
     """
-    root = np.sqrt(weight)[:, None]
-    one = np.ones((len(residual), 1))
-    rows = root * np.concatenate([basis, one, SQRT3 * along[:, None], residual[:, None]], axis=1)
+    b = len(basis)
+    columns = np.empty((len(residual), b + 3))
+    for k, column in enumerate(basis):
+        columns[:, k] = column
+    columns[:, b] = 1.0
+    columns[:, b + 1] = SQRT3 * along
+    columns[:, b + 2] = residual
+    return columns
+
+
+def line_moments(columns: FloatArray, weight: FloatArray, start: IntArray) -> FloatArray:
+    """Weighted second moments (S, b + 3, b + 3) of `line_columns`, one matrix a line.
+
+    `weight` (N,); `start` (S + 1,) tells where lines begin.
+    """
+    rows = np.sqrt(weight)[:, None] * columns
     out = np.empty((len(start) - 1, rows.shape[1], rows.shape[1]))
+    begin = start.tolist()
     for j in range(len(out)):
-        block = rows[start[j] : start[j + 1]]
-        out[j] = block.T @ block
+        block = rows[begin[j] : begin[j + 1]]
+        np.dot(block.T, block, out=out[j])
     return out
 
 

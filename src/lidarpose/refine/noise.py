@@ -17,8 +17,12 @@ REJECT = 5.0
 
 def taper_weights(standardised: FloatArray) -> FloatArray:
     """Weights (N,) of residuals in units of sigma, in the manner of Hampel's three-part loss: 99.7 % efficient."""
-    z = np.clip((np.abs(standardised) - CORE) / (REJECT - CORE), 0.0, 1.0)
-    return np.asarray(0.5 * (1.0 + np.cos(np.pi * z)))
+    size = np.abs(standardised)
+    weights = np.ones(size.shape)
+    beyond = np.flatnonzero(~(size <= CORE))  # few (or NaN): cosines of all would cost far more
+    z = np.minimum((size.flat[beyond] - CORE) / (REJECT - CORE), 1.0)
+    weights.flat[beyond] = 0.5 * (1.0 + np.cos(np.pi * z))
+    return weights
 
 
 @cache
@@ -63,10 +67,12 @@ def information_correction(standardised: FloatArray, weight: FloatArray) -> floa
     """
     if not len(standardised) or not weight.any():
         return 1.0
-    z = np.abs(standardised)
+    size = np.abs(standardised)
     psi = weight * standardised
-    t = np.clip((z - CORE) / (REJECT - CORE), 0.0, 1.0)
-    slope = weight - np.where((t > 0.0) & (t < 1.0), 0.5 * np.pi * z / (REJECT - CORE) * np.sin(np.pi * t), 0.0)
+    bent = np.flatnonzero((size > CORE) & (size < REJECT))
+    z = size[bent]
+    slope = weight.copy()
+    slope[bent] -= 0.5 * np.pi * z / (REJECT - CORE) * np.sin(np.pi * (z - CORE) / (REJECT - CORE))
     square, bend, mean_weight = float((psi**2).mean()), float(slope.mean()), float(weight.mean())
     if square <= 0.0 or bend <= 0.1:
         return 1.0

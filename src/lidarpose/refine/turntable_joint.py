@@ -325,7 +325,7 @@ def all_moments(data: JointData, at: Linearised, noise: Noise) -> Moments:
     for kind, residuals in at.lines.items():
         lines = lines_of(data, kind)
         weight = _row_weight(lines, residuals, noise.lines[kind])
-        out[kind] = line_moments(residuals.basis, lines.along, residuals.residual, weight, lines.start)
+        out[kind] = line_moments(residuals.columns, weight, lines.start)
     return out
 
 
@@ -410,9 +410,7 @@ def carried_over(data: JointData, at: Linearised, earlier: Noise) -> Noise:
         layout, known = lines_of(data, kind), earlier.lines[kind]
         weights = np.ones(len(residuals.residual))
         rough = replace(known, row_weights=weights)
-        moments = line_moments(
-            residuals.basis, layout.along, residuals.residual, _row_weight(layout, residuals, rough), layout.start
-        )
+        moments = line_moments(residuals.columns, _row_weight(layout, residuals, rough), layout.start)
         _, effects = take_out_effects(moments, known.place_variance)
         z = _without_effects(layout, residuals, effects) / (layout.sigma * known.factor)
         lines[kind] = replace(known, row_weights=taper_weights(z))

@@ -14,6 +14,7 @@ import numpy as np
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.se3 import Pose, skew
 from lidarpose.model.camera import Camera
+from lidarpose.refine.least_squares import line_columns
 from lidarpose.refine.turntable_layout import JointData, StripeRows, stripe_rays
 from lidarpose.refine.turntable_parameters import (
     BEAM,
@@ -33,13 +34,17 @@ class LineResiduals:
     """Residuals (N,) of lines of one kind, the basis of their derivatives, and how it maps to the parameters.
 
     ``d residual = basis @ to_parameters[line] @ step``: basis (N, b), to_parameters (S, b, N_GLOBAL + 6), whose last
-    six columns are of the line's own panel.
+    six columns are of the line's own panel. The basis stands in the first of `columns`, see `line_columns`.
     """
 
     residual: FloatArray
-    basis: FloatArray
+    columns: FloatArray
     to_parameters: FloatArray
     valid: BoolArray
+
+    @property
+    def basis(self) -> FloatArray:
+        return self.columns[:, :-3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,18 +145,19 @@ def stripe_residuals(data: JointData, state: JointState) -> LineResiduals:
     # Where the measured normal runs along the predicted stripe, a pixel across it says nothing.
     valid &= np.abs(per_pixel) > 0.02 * depth * rows.ray_size_px
     centre = np.einsum("kij,ki->kj", R_panel, t_panel)[lines.slot][of_row]
-    basis = np.empty((len(valid), 9))
-    basis[:, 0] = np.where(valid, inverse, 0.0)
+    inverse = np.where(valid, inverse, 0.0)
     depth = np.where(valid, depth, 0.0)
     alpha = np.where(valid, alpha, 0.0)
     on_stripe = np.where(valid, residual, 0.0)
-    basis[:, 1] = basis[:, 0] * (depth * (ray_x - on_stripe * px_x) - centre[:, 0])
-    basis[:, 2] = basis[:, 0] * (depth * (ray_y - on_stripe * px_y) - centre[:, 1])
-    basis[:, 3:6] = alpha[:, None] * basis[:, :3]
+    by_light = (
+        inverse,
+        inverse * (depth * (ray_x - on_stripe * px_x) - centre[:, 0]),
+        inverse * (depth * (ray_y - on_stripe * px_y) - centre[:, 1]),
+    )
     # Of the point on the stripe too: at the measured pixel the focal length would take the noise's square for signal.
     focal_m, focal_n = focal_m + on_stripe * px_m, focal_n + on_stripe * px_n
-    for column, (by_m, by_n) in enumerate(((focal_m, focal_n), (x_m, x_n), (y_m, y_n)), start=6):
-        basis[:, column] = basis[:, 0] * depth * (by_m - alpha * by_n)
+    by_camera = [inverse * depth * (m - alpha * n) for m, n in ((focal_m, focal_n), (x_m, x_n), (y_m, y_n))]
+    basis = (*by_light, *(alpha * column for column in by_light), *by_camera)
     to = np.zeros((lines.count, 9, N_GLOBAL + 6))
     light = _moment_map(R_place[lines.place, :, 2], R_panel[lines.slot], t_panel[lines.slot])
     to[:, :3, : N_MOTION + 1] = -np.swapaxes(light, 1, 2) @ J_place[lines.place]
@@ -159,7 +165,7 @@ def stripe_residuals(data: JointData, state: JointState) -> LineResiduals:
     to[:, 3:6, N_GLOBAL:] = np.swapaxes(map_panel[lines.slot], 1, 2) @ J_panel[lines.slot]
     for column, p in enumerate(CAMERA_EXTRAS, start=6):
         to[:, column, p] = 1.0
-    return LineResiduals(np.where(valid, residual, 0.0), basis, to, valid)
+    return LineResiduals(on_stripe, line_columns(basis, lines.along, on_stripe), to, valid)
 
 
 _LARGEST_STEP_PX = 100.0
@@ -211,9 +217,7 @@ def range_residuals(data: JointData, state: JointState) -> LineResiduals:
     grow = inverse * (1.0 + scale)
     d_angle = -predicted * (-s * n_lidar[:, 0] + c * n_lidar[:, 1]) * grow
     flag = valid.astype(np.float64)
-    basis = np.stack(
-        [grow, grow * X, grow * Y, -flag, -predicted, -d_angle * rows.angle_rad, -flag * rows.darkness], axis=1
-    )
+    basis = (grow, grow * X, grow * Y, -flag, -predicted, -d_angle * rows.angle_rad, -flag * rows.darkness)
     to = np.zeros((lines.count, 7, N_GLOBAL + 6))
     plane = np.swapaxes(map_panel[lines.slot], 1, 2)
     to[:, :3, : N_MOTION + 1] = plane @ J_place[lines.place]
@@ -221,4 +225,5 @@ def range_residuals(data: JointData, state: JointState) -> LineResiduals:
     for row, column in zip(range(3, 7), (OFFSET, RANGE_SCALE, BEAM, BLACK), strict=True):
         to[:, row, column] = 1.0
     residual = rows.range_m - (1.0 + scale) * predicted - offset_m - black * rows.darkness
-    return LineResiduals(np.where(valid, residual, 0.0), basis, to, valid)
+    residual = np.where(valid, residual, 0.0)
+    return LineResiduals(residual, line_columns(basis, lines.along, residual), to, valid)
