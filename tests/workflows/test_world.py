@@ -9,10 +9,10 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.calibration import WorldCalibration
-from lidarpose.model.corner_session import CornerSession
+from lidarpose.model.corner_session import CornerSession, MemoryCloud
 from lidarpose.simulate.corner_scene import CornerSceneSpec, CornerTruth, paper_rotation, simulate_corner_session
 from lidarpose.workflows.moving_target import find_by_motion
-from lidarpose.workflows.world import LocatedTarget, calibrate_world, locate_target
+from lidarpose.workflows.world import LocatedTarget, calibrate_world, locate_target, world_run
 
 Simulated = tuple[CornerSession, CornerTruth, LocatedTarget]
 
@@ -145,3 +145,17 @@ def test_what_moves_gives_the_same_corners_as_the_full_search(simulated: Simulat
     places = list(session.places)
     places[1] = replace(places[1], clouds=places[3].clouds)
     assert find_by_motion(replace(session, places=tuple(places)), world) is None
+
+
+def test_a_frame_in_which_the_target_was_bumped_is_left_out(simulated: Simulated) -> None:
+    session, truth, _ = simulated
+    places = list(session.places)
+    clouds = list(places[2].clouds)
+    cloud = clouds[3].load()
+    clouds[3] = MemoryCloud("bumped", replace(cloud, points=cloud.points + np.float32(0.03)))
+    places[2] = replace(places[2], clouds=tuple(clouds))
+    run = world_run(replace(session, places=tuple(places)))
+    used = run.places[2].frame_used
+    assert not used[3]
+    assert used.sum() >= 4
+    assert run.calibration.T_world_source.distance(truth.T_world_lidar)[0] < 0.0008

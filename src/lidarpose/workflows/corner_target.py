@@ -46,8 +46,9 @@ INNER_SHARE = 0.6
 INNER_STEPS, FIT_STEPS = 2, 5
 # A corner that moved by no more since its beams were selected selects the same ones.
 SETTLED_M, INNER_SETTLED_M = 5e-4, 3e-3
-# What is cut out around the faces as sighted: the fitted corner may be this far from the sighted one.
-CROP_MARGIN_M = 0.15
+# What is cut out around the faces as sighted: the fitted corner may be this far from the sighted one, but for a
+# sighting that is a fit itself.
+CROP_MARGIN_M, CLOSE_CROP_M = 0.15, 0.06
 GOLDEN = 0.6180339887498949
 
 Tick = Callable[[], None]
@@ -335,13 +336,14 @@ def _not_found(session: CornerSession, candidates: Sequence[Sequence[CornerCandi
 def gather(session: CornerSession, found: FoundTarget, *, tick: Tick = lambda: None) -> tuple[PlaceCrop, ...]:
     """Cut the target's surroundings from all frames of all places."""
     corners, radius = expected_corners(found), _crop_radius(found)
+    margin_m = CLOSE_CROP_M if found.by_motion else CROP_MARGIN_M
 
     def crop(task: tuple[CornerPlace, FloatArray, CornerCandidate | None]) -> PlaceCrop:
         place, corner, sighting = task
         low, high = corner - radius, corner + radius
         if sighting is not None:
             outlines = np.concatenate(sighting.outlines)
-            low, high = outlines.min(axis=0) - CROP_MARGIN_M, outlines.max(axis=0) + CROP_MARGIN_M
+            low, high = outlines.min(axis=0) - margin_m, outlines.max(axis=0) + margin_m
         parts = []
         for source in place.clouds:
             parts.append(_inside_box(source.load().points, low, high))

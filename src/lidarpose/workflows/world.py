@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarpose.detect.paper_corners import harris_corner, ransac_corner
 from lidarpose.errors import UndeterminedError
-from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.robust import box_plot_inliers
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.calibration import WorldCalibration
@@ -55,6 +55,8 @@ WORLD_METHODS: tuple[WorldMethod, ...] = ("joint", "paper", "paper-approx", "ran
 
 # Frames whose corner is this far out are of another scene: someone walked by, the target was being moved.
 JOINT_WHISKER = 3.0
+# The same of frames with less than this share of the returns that others have on the faces.
+FEWER_RETURNS = 0.6
 MIN_FRAMES_FOR_BOX_PLOT = 5
 # Returns around the target, of all frames of a place together, from which the first estimate is made.
 FIRST_RETURNS = 3000
@@ -250,7 +252,10 @@ def _joint(
     }
     places, frame_scatter, dropped = _without_odd_frames(observed, by_frame)
     fit, used = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too)
-    left_out += [LeftOut(f"{name}: {n} frames", "their corner is far from the others'") for name, n in dropped.items()]
+    left_out += [
+        LeftOut(f"{name}: {n} frames", "their corner, or how much of the faces they show, is far from the others'")
+        for name, n in dropped.items()
+    ]
     evidence = CornerEvidence(
         tuple(p.position for p in used),
         tuple(left_out),
@@ -361,15 +366,19 @@ def _corners(start: CornerState, fits: Sequence[FreeCorner | None], found: Found
 def _without_odd_frames(
     places: Sequence[CornerPlaceFaces], by_frame: Mapping[str, FloatArray]
 ) -> tuple[list[CornerPlaceFaces], dict[str, FloatArray], dict[str, int]]:
-    """Leave out frames whose corner is far from the others', coordinate by coordinate (the paper's box plot)."""
+    """Leave out frames whose corner is far from the others', coordinate by coordinate (the paper's box plot), and those
+    that have far fewer returns on the faces than the others: there something stood before them, or they elsewhere."""
     kept, scatter, dropped = [], {}, {}
     for place in places:
         corners = by_frame.get(place.position)
         if corners is not None and place.frames >= MIN_FRAMES_FOR_BOX_PLOT:
             known = np.isfinite(corners).all(axis=1)
-            good = np.ones(place.frames, dtype=bool)
+            good = _full_frames(place)
+            known &= good
             if known.sum() >= MIN_FRAMES_FOR_BOX_PLOT:
-                inside = [box_plot_inliers(corners[known, k], JOINT_WHISKER) for k in range(3)]
+                # Quartiles of a few frames scatter themselves.
+                whisker = JOINT_WHISKER * (1.0 + MIN_FRAMES_FOR_BOX_PLOT / known.sum())
+                inside = [box_plot_inliers(corners[known, k], whisker) for k in range(3)]
                 good[known] = np.all(inside, axis=0)
                 scatter[place.position] = corners[good & known].std(axis=0, ddof=1)
             if not good.all():
@@ -378,6 +387,12 @@ def _without_odd_frames(
                 place = replace(place, faces=faces)
         kept.append(place)
     return kept, scatter, dropped
+
+
+def _full_frames(place: CornerPlaceFaces) -> BoolArray:
+    """Which frames (F,) of a place have about as many returns on the faces as the others."""
+    count = sum(np.bincount(returns.frame, minlength=place.frames) for returns in place.faces.values())
+    return np.asarray(count >= FEWER_RETURNS * np.median(count))
 
 
 def _frames_only(returns: FaceReturns, good: Any) -> FaceReturns:
