@@ -204,6 +204,17 @@ def test_a_table_that_slips_once_is_named_with_its_place(jump_deg: float) -> Non
     assert sound.jumps == ()
 
 
+def test_sweeps_that_changed_places_are_not_called_good() -> None:
+    truth = mounted((0.8, -0.6), (0.02, -0.01))
+    returns = seen(planes_of(WALLS + FLOOR_AND_CEILING), truth, noise_m=0.005, seed=5, sweeps=120, beams=60)
+    # The first with the second, the third with the fourth ...
+    step = 2.0 * np.pi / 120
+    swapped = replace(returns, reading_rad=returns.reading_rad + np.where(returns.sweep % 2 == 0, step, -step))
+    estimate = refine_mounting(swapped, UPRIGHT)
+    assert estimate.quality.verdict == "doubtful"
+    assert np.degrees(estimate.reading_scatter_rad) > 1.5
+
+
 @pytest.mark.parametrize("rows", [FLOOR_AND_CEILING, FLOOR_AND_CEILING[:1], WALLS[:2]])
 def test_too_few_surfaces_are_refused(rows: list[tuple[float, float, float, float]]) -> None:
     returns = seen(planes_of(rows), mounted((1.0, 1.0), (0.0, 0.0)), noise_m=0.005, seed=6)

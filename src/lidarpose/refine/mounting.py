@@ -122,8 +122,8 @@ def refine_mounting(
     _refuse_undetermined(covariance, options.estimate)
     tested = _extras(solution, evidence, options.estimate, covariance)
     bent = bending(solution, returns)
-    scatter = reading_scatter(solution, returns)
-    jumps = reading_jumps(solution, returns)
+    jumps, from_steps = reading_jumps(solution, returns)
+    scatter = max(reading_scatter(solution, returns), from_steps)
     surfaces = _surfaces(solution, evidence, returns)
     quality = _quality(solution, evidence, tested, covariance, bent, scatter, jumps, surfaces, options)
     return MountingEstimate(

@@ -25,6 +25,8 @@ LEAST_SLOPE_M = 1e-3
 LEAST_JUMP_RAD = np.radians(0.5)
 LEAST_SIGMAS = 6.0
 AGREED = 0.7
+# Ranges bend between two sweeps: less than this share of a step is not told from that.
+LEAST_SHARE = 0.1
 # Of a median of normal values, over that of their mean.
 _MEDIAN_SIGMA = 1.2533
 
@@ -39,22 +41,30 @@ class _Step:
     agreed: float
 
 
-def reading_jumps(solution: Solution, returns: FlatReturns) -> tuple[ReadingJump, ...]:
-    """The jumps of a recording, the largest first. Compared with the typical step, which a factor spoils alike."""
+def reading_jumps(solution: Solution, returns: FlatReturns) -> tuple[tuple[ReadingJump, ...], float]:
+    """The jumps of a recording, the largest first, and what all readings scatter by (rad, robust).
+
+    Both are of what is seen beside the readings, compared with the typical step, which a factor spoils alike.
+    """
     steps = _steps(solution, returns)
     if len(steps) < 5:
-        return ()
+        return (), 0.0
     excess = np.array([wrap_angle(s.seen - s.stated) for s in steps])
     excess = excess - np.median(excess)
     scatter = mad_sigma(excess, centred=True)
+    least = LEAST_SHARE * float(np.median([abs(s.stated) for s in steps]))
     found = [
         (abs(x), s)
         for x, s in zip(excess, steps, strict=True)
-        if abs(x) > max(LEAST_JUMP_RAD, LEAST_SIGMAS * float(np.hypot(s.sigma, scatter)))
+        if abs(x) > max(LEAST_JUMP_RAD, least, LEAST_SIGMAS * float(np.hypot(s.sigma, scatter)))
         and s.alike >= LEAST_ALIKE
         and s.agreed >= AGREED
     ]
-    return tuple(ReadingJump(s.sweeps, s.stated, s.seen) for _, s in sorted(found, key=lambda f: -f[0]))
+    jumps = tuple(ReadingJump(s.sweeps, s.stated, s.seen) for _, s in sorted(found, key=lambda f: -f[0]))
+    noise = float(np.median([s.sigma for s in steps]))
+    # A step holds the errors of two readings.
+    beyond = float(np.sqrt(max(scatter**2 - noise**2, 0.0) / 2.0))
+    return jumps, beyond if beyond > least else 0.0
 
 
 def _steps(solution: Solution, returns: FlatReturns) -> list[_Step]:
