@@ -48,10 +48,10 @@ class Metric:
 
 
 _PLANES = (
-    "In one thread three planes of 700 k points take about 30 ms: 4 for hypotheses and 6 for testing patches in a "
-    "subsample of 8192 points, 15 for the one pass over all points (each is read, rounded, held against the planes, "
-    "and put into a cell where near), 4 for the planes and the points' numbers. Cores share the pass alone. Compiled "
-    "kernels would make it cheaper, and each process half a second longer where numba has to be imported."
+    "In one thread, beside other work, three planes of 700 k points take 33 ms: 3 for hypotheses and 6 for testing "
+    "patches in a subsample of 8192 points, 15 for the one pass over all points (each is rounded, held against planes "
+    "and put into a cell where near), 5 for the planes and the points' numbers. The cores share only the pass and what "
+    "follows. Compiled kernels would make it cheaper, and each process half a second longer where numba is imported."
 )
 
 _STRIPES = (

@@ -37,15 +37,14 @@ EVIDENCE_POINTS = 8000
 CLUTTERED = 0.02
 # A cell of a surface has at least this share of its claims within the gate.
 STANDS_OUT = 0.7
-# Heights around the gate, one sigma wide, that tell what enters and leaves as the plane moves.
-RIM_SIGMAS = (2.5, 3.5)
-# At most this share of the points' information may be at the gate; else it is no gate.
-MOST_AT_GATE = 0.5
-# A step of more than this many standard deviations of the result is followed by another; sooner where it costs little.
+# By how much the mean of normal heights follows where the gate stays: 1 - 6 phi(3) / (1 - 2 Phi(-3)).
+FOLLOWED = 0.9733
+# A step of more than this many standard deviations of the result is followed by another; sooner where it costs little,
+# and in clutter, whose heights do not follow.
 LARGE_STEP = 20.0
 SMALL_STEP = 0.5
 FEW_POINTS = 50_000
-MOST_STEPS = 5
+MOST_STEPS = 6
 FEWEST = 6
 SPREAD_POINTS = 10_000
 # Of the terms 1, height, u, v.
@@ -126,21 +125,16 @@ class _Claims:
     held: BoolArray
     disputed: IntArray
 
-    def moments(self, rest: Float32Array, sigma_m: float) -> tuple[FloatArray, FloatArray]:
-        """Sums (4, 4) of the terms' products within the gate, and (3, 3) of (1, u, v) around it, by heights (M,)."""
+    def moments(self, rest: Float32Array, sigma_m: float) -> Float32Array:
+        """Sums (4, 4) of the terms' products within the gate and outside of seams, by the points' heights (M,)."""
         apart = np.abs(rest)
         apart[self.disputed] = np.inf
-        low, high = (np.float32(s * sigma_m) for s in RIM_SIGMAS)
-        off = np.flatnonzero(apart > low)
-        off = off[(apart.take(off) < high) & self.held.take(off)]
-        rim = self.terms.take(off, axis=1)[_ON_PLANE]
         inside = apart < np.float32(GATE_SIGMAS * sigma_m)
         inside &= self.held
-        # A copy: for an array times itself NumPy asks BLAS for a product that it does share out, however small.
-        return (self.terms * inside.astype(np.float32)) @ self.terms.T, rim.copy() @ rim.T
+        return np.asarray((self.terms * inside.astype(np.float32)) @ self.terms.T)
 
 
-_Part = tuple[_Claims, FloatArray, FloatArray]
+_Part = tuple[_Claims, Float32Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +195,8 @@ def patches_of_slabs(
             patches.append(None)
             continue
         patch = PlanePatch(slabs[k].leant(fit.lean), np.concatenate([m[k] for m in members]), fit.sigma_m)
-        every = sum(len(claims.indices) for claims, _, _ in of_slabs[k]) // EVIDENCE_POINTS + 1
-        around = [claims.indices[::every][claims.held[::every]] for claims, _, _ in of_slabs[k]]
+        every = sum(len(claims.indices) for claims, _ in of_slabs[k]) // EVIDENCE_POINTS + 1
+        around = [claims.indices[::every][claims.held[::every]] for claims, _ in of_slabs[k]]
         patches.append(Claim(patch, fit.variances, np.concatenate(around)))
     return patches
 
@@ -241,41 +235,45 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
     parts = []
     for slab, (indices, terms, held, doubtful) in zip(slabs, found, strict=True):
         claims = _Claims(indices + block.start, terms, held, doubtful[times[indices[doubtful]] > 1])
-        parts.append((claims, *claims.moments(terms[1], slab.sigma_m)))
+        parts.append((claims, claims.moments(terms[1], slab.sigma_m)))
     return parts
 
 
 def _screened(slab: Slab, parts: Sequence[_Part]) -> Sequence[_Part]:
     """The claims without those in cells that hold hardly more than what lies around the slab there, where a chain of
     stray points led the subsample astray: few points, but far out. In clean surroundings nothing is asked."""
-    within = sum(float(moments[0, 0]) for _, moments, _ in parts)
-    held = sum(np.count_nonzero(claims.held) - len(claims.disputed) for claims, _, _ in parts)
-    if held - within < CLUTTERED * held:
+    if not _cluttered(parts):
         return parts
-    cells = [slab.cells(claims.terms) for claims, _, _ in parts]
+    cells = [slab.cells(claims.terms) for claims, _ in parts]
     inside, around = (np.zeros(len(slab.allowed)) for _ in range(2))
-    for (claims, _, _), cell in zip(parts, cells, strict=True):
+    for (claims, _), cell in zip(parts, cells, strict=True):
         near = np.abs(claims.terms[1]) < np.float32(GATE_SIGMAS * slab.sigma_m)
         inside += np.bincount(cell[claims.held & near], minlength=len(inside))
         around += np.bincount(cell[claims.held & ~near], minlength=len(inside))
     solid = inside > STANDS_OUT * (inside + around)
-    out = []
-    for (claims, _, _), cell in zip(parts, cells, strict=True):
-        kept = replace(claims, held=claims.held & solid[cell])
-        out.append((kept, *kept.moments(claims.terms[1], slab.sigma_m)))
-    return out
+    kept = [replace(claims, held=claims.held & solid[cell]) for (claims, _), cell in zip(parts, cells, strict=True)]
+    return [(claims, claims.moments(claims.terms[1], slab.sigma_m)) for claims in kept]
+
+
+def _cluttered(parts: Sequence[_Part]) -> bool:
+    """Whether many claims lie outside the gate."""
+    within = sum(float(moments[0, 0]) for _, moments in parts)
+    held = sum(np.count_nonzero(claims.held) - len(claims.disputed) for claims, _ in parts)
+    return held - within >= CLUTTERED * held
 
 
 def _fit(slab: Slab, parts: Sequence[_Part], widest_m: float) -> _Fit | None:
-    """Least squares of the heights within three sigmas of the plane itself, by Newton's method from the subsample's.
+    """Least squares of the heights within three sigmas of the plane itself, in steps from the subsample's.
 
-    That plane is right to a small fraction of a sigma, so that heights over it are distances.
+    That plane is right to a small fraction of a sigma, so that heights over it are distances. A step is what the mean
+    of normal heights within a gate that stays tells (one step of an M-estimate, Bickel 1975).
     """
     claims = [part[0] for part in parts]
-    sums = [part[1:] for part in parts]
+    sums = [part[1] for part in parts]
+    near_enough = SMALL_STEP if _cluttered(parts) else LARGE_STEP
     lean: FloatArray = np.zeros(3)
     for _ in range(MOST_STEPS):
-        moments, rim = (np.asarray(np.sum(each, axis=0, dtype=np.float64)) for each in zip(*sums, strict=True))
+        moments = np.asarray(np.sum(sums, axis=0, dtype=np.float64))
         count = moments[0, 0]
         if count < FEWEST:
             return None
@@ -283,9 +281,9 @@ def _fit(slab: Slab, parts: Sequence[_Part], widest_m: float) -> _Fit | None:
         variances = np.linalg.eigvalsh(plain[1:, 1:] / count - np.outer(plain[0, 1:], plain[0, 1:]) / count**2)
         if not variances[0] > 0.0:
             return None
-        step = _newton_step(plain, rim, moments[_ON_PLANE, 1] - plain @ lean)
+        step = np.linalg.solve(plain, moments[_ON_PLANE, 1] - plain @ lean) / FOLLOWED
         lean = lean + step
-        limit = SMALL_STEP if count < FEW_POINTS else LARGE_STEP
+        limit = SMALL_STEP if count < FEW_POINTS else near_enough
         if step @ plain @ step < (limit * slab.sigma_m) ** 2:
             break
         sums = [claim.moments(_rest(claim.terms, lean), slab.sigma_m) for claim in claims]
@@ -294,18 +292,6 @@ def _fit(slab: Slab, parts: Sequence[_Part], widest_m: float) -> _Fit | None:
     rest = rest[np.abs(rest) < GATE_SIGMAS * slab.sigma_m]
     sigma_m = min(max(mad_sigma(rest, centred=True), 0.5 * slab.sigma_m), widest_m)
     return _Fit(lean, sigma_m, variances)
-
-
-def _newton_step(plain: FloatArray, rim: FloatArray, gradient: FloatArray) -> FloatArray:
-    """By how much (3,) the plane has to lean so that the heights within the gate have no trend.
-
-    A plane that moves by h takes in h times the density of points at one side of the gate and loses as much at the
-    other, each three sigmas off: without that a step would fall short, by a fortieth in clean surroundings.
-    """
-    width = RIM_SIGMAS[1] - RIM_SIGMAS[0]
-    at_gate = rim * (GATE_SIGMAS / width)
-    share = float(np.abs(np.linalg.eigvals(np.linalg.solve(plain, at_gate))).max())
-    return np.asarray(np.linalg.solve(plain - at_gate * min(1.0, MOST_AT_GATE / max(share, 1e-9)), gradient))
 
 
 def _rest(terms: Float32Array, lean: FloatArray) -> Float32Array:
@@ -322,7 +308,7 @@ def _members(block: slice, parts: Sequence[_Part], fits: Sequence[_Fit | None]) 
     """Indices of the points of a block within three sigmas of each plane; in seams the first plane takes them."""
     taken = np.zeros(block.stop - block.start, dtype=bool)
     members = []
-    for (claims, _, _), fit in zip(parts, fits, strict=True):
+    for (claims, _), fit in zip(parts, fits, strict=True):
         if fit is None:
             members.append(np.zeros(0, dtype=np.int64))
             continue
