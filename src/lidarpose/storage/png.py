@@ -2,7 +2,8 @@
 
 The fast one is kornia-rs (extra `fast`). It holds the interpreter's lock, so that it pays only where no other thread
 wants to work; and it is asked only for 8-bit grey images without anything that could change their values. Whatever it
-does not decode is left to OpenCV, which also has the last word on what is broken.
+does not decode is left to OpenCV, which also has the last word on what is broken. It checks the chunks' CRC-32, which
+tells damage to a file, but not the Adler-32 of the data inside them: only a faulty writer gets that one wrong alone.
 """
 
 from __future__ import annotations
