@@ -171,7 +171,11 @@ def test_other_parameters_are_found_too(name: str, value: float) -> None:
         middle = 0.5 * (true.reading_rad.min() + true.reading_rad.max())
         readings = middle + (true.reading_rad - middle) / (1.0 + value)
         stated = FlatReturns(readings, true.beam_rad, true.range_m, true.sweep, true.surface)
-    assert refine_mounting(stated, UPRIGHT).quality.verdict == "doubtful"
+    plain = refine_mounting(stated, UPRIGHT)
+    assert plain.quality.verdict == "doubtful"
+    # What is seen but not estimated is paid for.
+    off = errors(plain.T_table_lidar, truth)
+    assert off @ np.linalg.solve(plain.covariance, off) < 25.0
     found = refine_mounting(stated, UPRIGHT, MountingOptions((name,)))
     (extra,) = [e for e in found.extras if e.estimated]
     assert abs(extra.value - value) < 4.0 * extra.sigma + 1e-5

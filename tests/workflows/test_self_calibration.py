@@ -59,6 +59,21 @@ def test_a_room_tells_the_mounting(name: str) -> None:
     assert len(estimate.surfaces) >= 6
 
 
+def test_a_table_that_never_stops(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    start, readings, beams = RIGS["half a fan, a full turn"]
+    truth = mounting((1.8, -1.3), (0.03, -0.02), start)
+    # The beam turns once from a sweep to the next.
+    during = readings[:, None] + 3.0 * (beams - beams[0]) / 360.0
+    recording = sweep_room(truth, during, beams, seed=1)
+    times = 0.1 * np.arange(len(readings))
+    write_recording(tmp_path / "r", replace(recording, turntable_angle_deg=readings, time_s=times))
+    call = ["calibrate", str(tmp_path / "r"), "-o", str(tmp_path / "out"), "--axis-beam-deg", "90", "--never-stops"]
+    assert run([*call, "--quiet"]) == 0
+    motion = read_turntable_calibration(tmp_path / "out" / "calibration.json").motion
+    assert np.degrees(np.arccos(motion.T_turntable_lidar.rotation[2] @ truth.rotation[2])) < 0.1
+    assert "verdict: good" in capsys.readouterr().out
+
+
 def test_a_rough_start_suffices_and_the_opposite_one_gives_the_mirror_image() -> None:
     start, readings, beams = RIGS["half a fan, a full turn"]
     truth = mounting((1.8, -1.3), (0.03, -0.02), start)

@@ -42,6 +42,7 @@ def calibrate(
     estimate_scale: Annotated[bool, Parameter(negative=(), show_default=False, group="Corner sessions")] = False,
     axis_beam_deg: Annotated[FiniteFloat | None, Parameter(group="Sweep recordings")] = None,
     start: Annotated[Path | None, Parameter(group="Sweep recordings")] = None,
+    never_stops: Annotated[bool, Parameter(negative=(), show_default=False, group="Sweep recordings")] = False,
     want_mm: PositiveFloat | None = None,
     want_deg: PositiveFloat | None = None,
     report: Annotated[bool, Parameter(negative="--no-report", show_default=False)] = True,
@@ -82,6 +83,8 @@ def calibrate(
         The beam angle that points along the turntable's axis, to some degrees, where the fan of beams holds the axis.
     start
         A calibration that is right to some degrees and centimetres: how any other rig is mounted.
+    never_stops
+        The turntable turned on during the sweeps: interpolate its readings by time_s.npy. Scan with it, too.
     want_mm
         Standard deviation of the LiDAR's centre that is good enough, in mm.
     want_deg
@@ -96,11 +99,21 @@ def calibrate(
     prepare_folder(output)
     if is_recording(session):
         _calibrate_recording(
-            session, output, method, estimate, axis_beam_deg, start, want_mm, want_deg, json=json, quiet=quiet
+            session,
+            output,
+            method,
+            estimate,
+            axis_beam_deg,
+            start,
+            want_mm,
+            want_deg,
+            never_stops=never_stops,
+            json=json,
+            quiet=quiet,
         )
         return
-    if axis_beam_deg is not None or start is not None:
-        option = "--start" if axis_beam_deg is None else "--axis-beam-deg"
+    if axis_beam_deg is not None or start is not None or never_stops:
+        option = "--axis-beam-deg" if axis_beam_deg is not None else "--start" if start is not None else "--never-stops"
         raise InputError(option, "is for sweep recordings", expected="a folder with recording.toml")
     found = session_format(session)
     if found == CORNER_SESSION_FORMAT:
@@ -144,6 +157,7 @@ def _calibrate_recording(
     want_mm: float | None,
     want_deg: float | None,
     *,
+    never_stops: bool,
     json: bool,
     quiet: bool,
 ) -> None:
@@ -156,6 +170,7 @@ def _calibrate_recording(
         output,
         axis_beam_deg=axis_beam_deg,
         start=start,
+        never_stops=never_stops,
         estimate=estimate,
         want_mm=want_mm,
         want_deg=want_deg,

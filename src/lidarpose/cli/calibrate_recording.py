@@ -34,6 +34,7 @@ def calibrate_recording(
     *,
     axis_beam_deg: float | None,
     start: Path | None,
+    never_stops: bool = False,
     estimate: tuple[str, ...] = (),
     want_mm: float | None = None,
     want_deg: float | None = None,
@@ -47,6 +48,8 @@ def calibrate_recording(
     axis_beam_deg, start
         One of the two: the beam angle that points along the turntable's axis, or a calibration file that is roughly
         right.
+    never_stops
+        Readings are interpolated by the sweeps' times.
     estimate
         Extra parameters by their names on the command line.
 
@@ -62,15 +65,19 @@ def calibrate_recording(
     from lidarpose.storage.calibration import write_calibration
     from lidarpose.storage.provenance import provenance
     from lidarpose.storage.recording import read_recording, recording_files
+    from lidarpose.workflows.measuring import with_readings_between
     from lidarpose.workflows.self_calibration import MOST_ROUNDS, calibrate_by_flatness
 
     T_table_lidar = _start(axis_beam_deg, start)
     wishes = {k: v for k, v in (("want_mm", want_mm), ("want_deg", want_deg)) if v is not None}
     options = MountingOptions(tuple(_parameter(name) for name in estimate), **wishes)
     recording = read_recording(folder)
+    if never_stops and not recording.has_reading_per_beam:
+        recording = with_readings_between(recording)
     stated = {
         "axis_beam_deg": axis_beam_deg,
         "start": None if start is None else start.name,
+        "never_stops": never_stops,
         "estimate": list(estimate),
         **wishes,
     }

@@ -121,6 +121,7 @@ def refine_mounting(
         raise _undetermined("The flat surfaces seen leave the mounting open") from error
     _refuse_undetermined(covariance, options.estimate)
     tested = _extras(solution, evidence, options.estimate, covariance)
+    covariance = _paid_for(covariance, evidence, free, tested)
     bent = bending(solution, returns)
     jumps, from_steps = reading_jumps(solution, returns)
     scatter = max(reading_scatter(solution, returns), from_steps)
@@ -193,6 +194,18 @@ def _extras(
         return tuple(out)
     best = max(gains, key=lambda name: gains[name])
     return tuple(ExtraParameter(e.name, e.value, e.sigma, e.estimated, e.observable, e.name == best) for e in out)
+
+
+def _paid_for(
+    covariance: FloatArray, evidence: Evidence, free: IntArray, extras: Sequence[ExtraParameter]
+) -> FloatArray:
+    """The covariance with what a missing parameter moves the estimate by, squared."""
+    for k, extra in enumerate(extras):
+        if extra.suggested:
+            A = evidence.information
+            move = -extra.value * np.linalg.solve(A[np.ix_(free, free)], A[free, N_MOUNTING + k])
+            covariance = covariance + np.outer(move, move)
+    return covariance
 
 
 def _one_step(evidence: Evidence, free: IntArray, index: int) -> tuple[float, float, float]:
