@@ -31,6 +31,8 @@ MOST_PLACES = 12
 # Corners that are tried, best supported first; a scene in which more has moved is for the full search.
 MOST_CORNERS = 3
 FEWEST_MOVED = 60
+# A scan of more points is searched as a whole: a subsample of it shows the target as well.
+MOST_POINTS = 4_000_000
 # What lies about the target beyond its faces, for the planes that border it.
 AROUND_M = 0.4
 
@@ -59,6 +61,8 @@ def find_by_motion(session: CornerSession, world: FloatArray, *, seed: int = 0) 
         return None
     three = _widest_triangle(world)
     frames = {k: load_points(session.places[k].clouds[0]) for k in three}
+    if max(len(points) for points in frames.values()) > MOST_POINTS:
+        return None
     moved = {k: f[i] for (k, f), i in zip(frames.items(), moved_points(list(frames.values())), strict=True)}
     if min(len(points) for points in moved.values()) < FEWEST_MOVED:
         return None
