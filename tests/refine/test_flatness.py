@@ -126,6 +126,7 @@ def warped(returns: FlatReturns, T_table_lidar: Pose, bent_m: float, seed: int) 
     return replace(returns, range_m=ranges)
 
 
+@pytest.mark.slow
 def test_bent_walls_widen_the_covariance() -> None:
     planes = planes_of(WALLS + FLOOR_AND_CEILING)
     truth = mounted((0.8, -0.6), (0.02, -0.01))

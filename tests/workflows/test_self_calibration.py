@@ -74,6 +74,7 @@ def test_a_table_that_never_stops(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "verdict: good" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_rough_start_suffices_and_the_opposite_one_gives_the_mirror_image() -> None:
     start, readings, beams = RIGS["half a fan, a full turn"]
     truth = mounting((1.8, -1.3), (0.03, -0.02), start)
