@@ -48,7 +48,7 @@ class Metric:
 
 
 _PLANES = (
-    "In one thread, beside other work, three planes of 700 k points take 33 ms: 3 for hypotheses and 6 for testing "
+    "In one thread, beside other work, three planes of 700 k points take 34 ms: 4 for hypotheses and 6 for testing "
     "patches in a subsample of 8192 points, 15 for the one pass over all points (each is rounded, held against planes "
     "and put into a cell where near), 5 for the planes and the points' numbers. The cores share only the pass and what "
     "follows. Compiled kernels would make it cheaper, and each process half a second longer where numba is imported."

@@ -29,7 +29,7 @@ PLANES_AT_ONCE = 16
 # From this many points on, patches are found and tested in a subsample, and the whole cloud is asked once.
 DENSE = 200_000
 DENSE_SAMPLE = 8192
-DENSE_HYPOTHESES = 300
+DENSE_HYPOTHESES = 400
 FEWEST_OF_SAMPLE = 30
 # So many voxels of the subsample tell whether a patch is a surface, and so many hypotheses' neighbourhoods.
 ENOUGH_EVIDENCE = 1000
@@ -180,9 +180,8 @@ def _harvest_dense(
     share = count / len(few)
     fewest = max(int(least / share), FEWEST_OF_SAMPLE)
     jury = _one_of_each(len(few), SAMPLE_SIZE, rng)
-    # So thin a subsample has no gaps between scan lines left that wide neighbourhoods would have to bridge.
     fewer = replace(search, hypotheses=min(search.hypotheses, DENSE_HYPOTHESES))
-    sample = _draw(few, jury, sigma_m, fewer, rng, wide=False)
+    sample = _draw(few, jury, sigma_m, fewer, rng)
     sample.rivals, sample.refits = DENSE_RIVALS, DENSE_REFITS
     seen = _harvest(few, np.ones(len(few), dtype=bool), sample, fewest, at_most)
     slabs = [Slab.around(few[p.indices], p.plane, p.sigma_m) for p in seen]
@@ -216,14 +215,9 @@ def _one_of_each(count: int, parts: int, rng: np.random.Generator) -> IntArray:
 
 
 def _draw(
-    x: Float32Array,
-    remaining: IntArray,
-    sigma_m: float | None,
-    search: PlaneSearch,
-    rng: np.random.Generator,
-    wide: bool = True,
+    x: Float32Array, remaining: IntArray, sigma_m: float | None, search: PlaneSearch, rng: np.random.Generator
 ) -> _Sample:
-    """Draw a subsample of the remaining points, and hypotheses around random points of it; half of them `wide`."""
+    """Draw a subsample of the remaining points, and hypotheses around random points of it."""
     if len(remaining) > SAMPLE_SIZE:
         indices = remaining[rng.integers(0, len(remaining), SAMPLE_SIZE)]
         indices = np.unique(indices)
@@ -231,8 +225,8 @@ def _draw(
         indices = remaining
     points = x[indices]
     count = min(search.hypotheses, 4 * len(points))
-    thinned = points[rng.random(len(points)) < 1.0 / THINNED] if wide else points[:0]
-    seeds, chosen = _neighbourhoods(points, count // 2 if wide else count, rng)
+    thinned = points[rng.random(len(points)) < 1.0 / THINNED]
+    seeds, chosen = _neighbourhoods(points, count // 2, rng)
     if len(thinned) >= POINTS_PER_HYPOTHESIS:
         more_seeds, more = _neighbourhoods(thinned, count // 2, rng)
         seeds, chosen = np.concatenate([seeds, more_seeds]), np.concatenate([chosen, more])
