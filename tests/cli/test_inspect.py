@@ -3,9 +3,12 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lidarpose.cli.main import run
+from lidarpose.model.recording import SweepRecording
+from lidarpose.storage.recording import write_recording
 from tests_support.sessions import PLACES, blank_images, copy_session
 
 
@@ -21,6 +24,13 @@ def test_a_good_session_is_described_with_what_it_will_determine(
     assert 0.02 < sigma[1] < 1.0
     assert sigma[-1] > sigma[1], "half a turn away must be known less well than the arc"
     assert document["weak"][0]["remedy"]
+
+
+def test_a_recording_is_told_where_to_go(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recording = SweepRecording("r", np.arange(4.0), np.arange(5.0), np.ones((4, 5)))
+    write_recording(tmp_path / "r", recording)
+    assert run(["inspect", str(tmp_path / "r")]) == 2
+    assert "is a sweep recording" in capsys.readouterr().err
 
 
 def test_a_session_without_stripes_is_described_and_refused(

@@ -43,8 +43,16 @@ def inspect(
     table_turns
         The same for the turntable as its readings grow.
     """
+    from lidarpose.storage.recording import is_recording
     from lidarpose.storage.session import CORNER_SESSION_FORMAT, SESSION_FORMAT, session_format
 
+    if is_recording(session):
+        raise InputError(
+            session,
+            "is a sweep recording",
+            expected="a turntable or corner session",
+            remedy="`lidarpose calibrate` with --axis-beam-deg says how well a recording determines its mounting.",
+        )
     found = session_format(session)
     if found == CORNER_SESSION_FORMAT:
         _inspect_corners(session, json=json)
