@@ -56,8 +56,9 @@ def test_the_families_are_what_they_say() -> None:
     up_right = middle("paper").T_camera_lidar(40).rotation[:, 2] @ [1.0, -1.5, 0.0]
     upside_down = middle("upside-down").T_camera_lidar(40).rotation[:, 2] @ [1.0, -1.5, 0.0]
     assert up_right > 0.0 > upside_down
-    for family, axis in (("fold-vertical", 1), ("fold-horizontal", 0)):
-        rig = draw_rig(5, family=family)  # type: ignore[arg-type]
+    folds: dict[Family, int] = {"fold-vertical": 1, "fold-horizontal": 0}
+    for family, axis in folds.items():
+        rig = draw_rig(5, family=family)
         fold = rig.T_camera_panel[""][0].rotation[:, 0]
         assert np.argmax(np.abs(fold)) == axis
 

@@ -1,7 +1,9 @@
 """Calibration files: round trips, files of other programs, and contradictions."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,9 +23,9 @@ def calibration(seed: int = 0) -> TurntableCalibration:
     return TurntableCalibration(motion, root @ root.T, quality=quality, provenance={"seed": seed})
 
 
-def edit(path: Path, change: object) -> None:
+def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     document = json.loads(path.read_text())
-    change(document)  # type: ignore[operator]
+    change(document)
     path.write_text(json.dumps(document))
 
 
@@ -108,7 +110,7 @@ def test_a_world_calibration_round_trips(tmp_path: Path) -> None:
         (lambda d: d.update(kind="moon"), "kind"),
     ],
 )
-def test_contradictions_are_named(tmp_path: Path, change: object, message: str) -> None:
+def test_contradictions_are_named(tmp_path: Path, change: Callable[[dict[str, Any]], object], message: str) -> None:
     path = tmp_path / "c.json"
     write_calibration(path, calibration())
     edit(path, change)

@@ -8,6 +8,7 @@ import os
 import random
 import struct
 from pathlib import Path
+from typing import Literal
 
 import laspy
 import numpy as np
@@ -188,12 +189,12 @@ def test_a_pcd_header_that_the_file_does_not_keep(tmp_path: Path, old: str, new:
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_compressed"])
-def test_pcd_in_its_other_encodings(tmp_path: Path, encoding: str) -> None:
+def test_pcd_in_its_other_encodings(tmp_path: Path, encoding: Literal["ascii", "binary_compressed"]) -> None:
     cloud = make_cloud(300)
     cloud = Cloud(cloud.points, {**cloud.fields, "normal": np.eye(3, dtype=np.float32)[np.arange(300) % 3]})
     if encoding == "ascii":  # colours packed into a float do not survive text where they happen to be NaN
         cloud = Cloud(cloud.points, {k: v for k, v in cloud.fields.items() if k not in ("red", "green", "blue")})
-    pcd.write_encoded(tmp_path / "a.pcd", cloud, encoding)  # type: ignore[arg-type]
+    pcd.write_encoded(tmp_path / "a.pcd", cloud, encoding)
     assert_same(read_cloud(tmp_path / "a.pcd"), cloud)
 
 

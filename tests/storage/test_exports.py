@@ -19,6 +19,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.calibration import Calibration, TurntableCalibration, WorldCalibration
 from lidarpose.model.camera import Camera
+from lidarpose.model.corner_session import CloudFrame
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.storage.calibration import read_calibration, write_calibration
 from lidarpose.storage.camera_files import read_camera
@@ -38,9 +39,9 @@ def turntable(seed: int = 0, covariance: bool = True) -> TurntableCalibration:
     return TurntableCalibration(motion, np.diag(np.arange(1.0, 11.0)) * 1e-8 if covariance else None)
 
 
-def world(source: str = "lidar", scale: float = 1.0, seed: int = 1) -> WorldCalibration:
+def world(source: CloudFrame = "lidar", scale: float = 1.0, seed: int = 1) -> WorldCalibration:
     pose = Pose.exp(np.random.default_rng(seed).normal(size=6) * 2.0)
-    return WorldCalibration(pose, source, scale, np.eye(6) * 1e-6)  # type: ignore[arg-type]
+    return WorldCalibration(pose, source, scale, np.eye(6) * 1e-6)
 
 
 def camera_point(calibration: TurntableCalibration, angle_deg: float) -> np.ndarray:
@@ -80,9 +81,11 @@ def launch_nodes(text: str) -> list[dict[str, object]]:
     """The nodes of a launch file with their literal arguments, without importing it."""
     tree = ast.parse(text)
     constants = {
-        node.targets[0].id: ast.literal_eval(node.value)  # type: ignore[attr-defined]
+        target.id: ast.literal_eval(node.value)
         for node in tree.body
         if isinstance(node, ast.Assign)
+        for target in node.targets
+        if isinstance(target, ast.Name)
     }
 
     def value(node: ast.expr) -> object:
@@ -116,7 +119,8 @@ def test_ros2_turntable_is_a_robot_description_with_the_joint() -> None:
     calibration = turntable(2)
     (node,) = launch_nodes(export_text(calibration, "ros2"))
     assert node["executable"] == "robot_state_publisher"
-    (parameters,) = node["parameters"]  # type: ignore[misc]
+    assert isinstance(node["parameters"], list)
+    (parameters,) = node["parameters"]
     chain = kinpy.build_chain_from_urdf(parameters["robot_description"].encode())
     frames = chain.forward_kinematics({"turntable_joint": 1.0})
     same((frames["lidar"].matrix() @ np.append(POINT, 1.0))[:3], camera_point(calibration, np.rad2deg(1.0)))
@@ -132,7 +136,7 @@ def test_ros2_at_one_reading_is_a_static_transform(angle_deg: float) -> None:
 
 
 @pytest.mark.parametrize("source", ["lidar", "camera"])
-def test_world_calibrations(source: str, tmp_path: Path) -> None:
+def test_world_calibrations(source: CloudFrame, tmp_path: Path) -> None:
     calibration = world(source)
     wanted = calibration.T_world_source @ POINT
     child = {"lidar": "lidar", "camera": "camera_optical_frame"}[source]
