@@ -22,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.geometry.compiled import installed
 from lidarpose.geometry.se3 import Pose
-from lidarpose.measure.assemble import assemble, has_compiler
+from lidarpose.measure.assemble import assemble
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.turntable import TurntableMotion
@@ -60,7 +61,7 @@ def in_memory(sweeps: int, beams: int, repeats: int) -> dict[str, Any]:
         "numpy": lambda: assemble(source, MOTION, out=out, compiled=False),
     }
     first: float | None = None
-    if has_compiler():
+    if installed():
         first = seconds(lambda: assemble(source, MOTION, out=out, compiled=True))
         ways["compiled"] = lambda: assemble(source, MOTION, out=out, compiled=True)
     times: dict[str, list[float]] = {name: [] for name in ways}
@@ -90,7 +91,7 @@ print(time.perf_counter() - begin)
 
 def first_compiling(beams: int) -> float | None:
     """Seconds of a process that finds no kernels on the disk and compiles them; None without numba."""
-    if not has_compiler():
+    if not installed():
         return None
     with tempfile.TemporaryDirectory() as empty:
         command = [sys.executable, "-c", _ONE_SHOT, str(100 * beams), str(beams), "compiled"]
@@ -102,7 +103,7 @@ def first_compiling(beams: int) -> float | None:
 def one_shot(points: int, beams: int, repeats: int = 3) -> list[float | None]:
     """Seconds of assembling once in a new process: by NumPy, compiled, and as the package chooses by itself."""
     times: dict[str, list[float]] = {"numpy": [], "compiled": [], "default": []}
-    if not has_compiler():
+    if not installed():
         del times["compiled"]
     for _ in range(repeats):
         for way, values in times.items():

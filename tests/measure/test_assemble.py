@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidarpose.geometry.compiled import installed
 from lidarpose.geometry.se3 import Pose
-from lidarpose.measure.assemble import assemble, beam_origins_and_directions, has_compiler, readings_between
+from lidarpose.measure.assemble import assemble, beam_origins_and_directions, readings_between
 from lidarpose.measure.point_sigma import moved_variance, point_sigma
 from lidarpose.model.beam_correction import BeamCorrection
 from lidarpose.model.calibration import TurntableCalibration
@@ -45,7 +46,7 @@ def beam_by_beam(recording: SweepRecording, motion: TurntableMotion) -> np.ndarr
 @pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_assembles_each_beam_by_equation_28(per_beam: bool, compiled: bool, dtype: type) -> None:
-    if compiled and not has_compiler():
+    if compiled and not installed():
         pytest.skip("numba is not installed")
     rng = np.random.default_rng(1)
     motion, recording = some_motion(rng), some_recording(rng, per_beam=per_beam)

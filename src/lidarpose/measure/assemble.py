@@ -4,9 +4,8 @@ A beam of range rho at angle theta, seen at the turntable's reading psi, is the 
 ``T_camera_lidar(psi) @ (rho cos(theta), rho sin(theta), 0)``. Per sweep that is one multiplication and one addition a
 coordinate; for a reading a beam, a turn about z and one 3x3 map.
 
-Two ways give the same numbers: NumPy in blocks that fit the cache, and kernels compiled by numba (the `fast` extra),
-which pay from some ten million points on, because importing them costs more than assembling fewer. Both run on all
-cores.
+Two ways give the same numbers: NumPy in blocks that fit the cache, and kernels compiled by numba (the `fast` extra)
+where `geometry.compiled` says that they pay. Both run on all cores.
 """
 
 from __future__ import annotations
@@ -15,19 +14,19 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.se3 import rotation_z
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.turntable import TurntableMotion
 
-# Fewer points than this are assembled by NumPy before numba is imported.
-COMPILED_FROM_POINTS = 30_000_000
+# By how much kernels are done sooner, on two cores.
+SAVED_S_PER_POINT = 4e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +76,7 @@ def assemble(
     out
         Where to put the points, C-ordered (N, M, 3) of `dtype`; made if None.
     compiled
-        Force the compiled or the NumPy way; by default numba is used from `COMPILED_FROM_POINTS` on where installed.
+        Force the compiled or the NumPy way; by default kernels are used where they pay.
 
     Source: eq. (28) of the turntable paper.
     """
@@ -119,13 +118,8 @@ def readings_between(recording: SweepRecording, first: int = 0, last: int | None
 
 
 def pays_to_compile(recording: SweepRecording) -> bool:
-    """True if numba is installed and the recording is so large that importing it pays."""
-    return recording.range_m.size >= COMPILED_FROM_POINTS and has_compiler()
-
-
-def has_compiler() -> bool:
-    """True if numba is installed."""
-    return find_spec("numba") is not None
+    """Whether to assemble the whole recording by kernels."""
+    return pays(SAVED_S_PER_POINT * recording.range_m.size)
 
 
 def compact(

@@ -13,14 +13,15 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from lidarpose.geometry.compiled import kernel
 from lidarpose.geometry.se3 import rotation_z
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.turntable import TurntableMotion
 
 
+@kernel
 def _per_sweep(ranges: Any, matrix: Any, shift: Any, cosine: Any, sine: Any, points: Any) -> None:
     zero, nan = ranges.dtype.type(0.0), ranges.dtype.type(np.nan)
     for i in range(ranges.shape[0]):
@@ -43,6 +44,7 @@ def _per_sweep(ranges: Any, matrix: Any, shift: Any, cosine: Any, sine: Any, poi
             out[3 * j + 2] = a20 * x + a21 * y + t2
 
 
+@kernel
 def _per_beam(ranges: Any, reading_deg: Any, beam: Any, matrix: Any, shift: Any, radius: Any, points: Any) -> None:
     zero, nan = ranges.dtype.type(0.0), ranges.dtype.type(np.nan)
     to_rad = np.pi / 180.0
@@ -61,10 +63,6 @@ def _per_beam(ranges: Any, reading_deg: Any, beam: Any, matrix: Any, shift: Any,
             out[3 * j + 2] = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + shift[2]
 
 
-_compiled_per_sweep = njit(nogil=True, cache=True, error_model="numpy")(_per_sweep)
-_compiled_per_beam = njit(nogil=True, cache=True, error_model="numpy")(_per_beam)
-
-
 def block_per_sweep(
     recording: SweepRecording, motion: TurntableMotion, points: NDArray[Any]
 ) -> Callable[[int, int], None]:
@@ -80,7 +78,7 @@ def block_per_sweep(
     def work(first: int, last: int) -> None:
         rows = slice(first, last)
         ranges = np.ascontiguousarray(recording.range_m[rows], dtype=points.dtype)
-        _compiled_per_sweep(ranges, matrix[rows], shift[rows], cosine, sine, flat[rows])
+        _per_sweep(ranges, matrix[rows], shift[rows], cosine, sine, flat[rows])
 
     return work
 
@@ -101,6 +99,6 @@ def block_per_beam(
         rows = slice(first, last)
         ranges = np.ascontiguousarray(recording.range_m[rows], dtype=points.dtype)
         reading = np.ascontiguousarray(recording.turntable_angle_deg[rows], dtype=np.float64)
-        _compiled_per_beam(ranges, reading, beam, matrix, shift, radius, flat[rows])
+        _per_beam(ranges, reading, beam, matrix, shift, radius, flat[rows])
 
     return work

@@ -1,0 +1,95 @@
+"""When kernels pay, and that they work where nothing can be stored."""
+
+import subprocess
+import sys
+
+import pytest
+
+from lidarpose.geometry import compiled
+
+
+@pytest.fixture
+def fresh(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """As if this process had asked nothing yet and numba were not imported."""
+    monkeypatch.setattr(compiled, "_ledger", compiled._Ledger())
+    monkeypatch.delitem(sys.modules, "numba", raising=False)
+    monkeypatch.setattr(compiled, "_can_store", lambda: True)
+    return monkeypatch
+
+
+def pretend(monkeypatch: pytest.MonkeyPatch, importable: bool) -> list[int]:
+    """Count imports of numba instead of making them."""
+    asked: list[int] = []
+
+    def importing() -> bool:
+        asked.append(1)
+        return importable
+
+    monkeypatch.setattr(compiled, "_importable", importing)
+    return asked
+
+
+def test_work_that_saves_more_than_the_import_takes_kernels_at_once(fresh: pytest.MonkeyPatch) -> None:
+    pretend(fresh, True)
+    assert compiled.pays(1.01 * compiled.LOADING_S)
+
+
+def test_small_work_takes_kernels_once_it_has_lost_as_much_as_the_import(fresh: pytest.MonkeyPatch) -> None:
+    asked = pretend(fresh, True)
+    answers = [compiled.pays(0.11 * compiled.LOADING_S) for _ in range(12)]
+    assert answers == [False] * 9 + [True] * 3
+    assert len(asked) == 1
+
+
+def test_numba_that_is_imported_already_is_used(fresh: pytest.MonkeyPatch) -> None:
+    pretend(fresh, True)
+    fresh.setitem(sys.modules, "numba", object())
+    assert compiled.pays(1e-6)
+
+
+def test_numba_that_cannot_be_imported_is_asked_once_and_never_used(fresh: pytest.MonkeyPatch) -> None:
+    asked = pretend(fresh, False)
+    assert not any(compiled.pays(10.0) for _ in range(5))
+    assert len(asked) == 1
+
+
+def test_where_nothing_can_be_stored_kernels_have_to_be_worth_compiling(fresh: pytest.MonkeyPatch) -> None:
+    pretend(fresh, True)
+    fresh.setattr(compiled, "_can_store", lambda: False)
+    assert not compiled.pays(0.9 * compiled.COMPILING_S)
+    assert compiled.pays(0.2 * compiled.COMPILING_S)
+
+
+def test_a_way_that_is_forced_is_taken_and_leaves_no_trace(fresh: pytest.MonkeyPatch) -> None:
+    pretend(fresh, True)
+    with compiled.forced(False):
+        assert not compiled.pays(100.0)
+    with compiled.forced(True):
+        assert compiled.pays(0.0)
+    assert not compiled.pays(0.5 * compiled.LOADING_S)
+
+
+@pytest.mark.skipif(not compiled.installed(), reason="numba is not installed")
+def test_kernels_compile_in_memory_where_there_is_no_folder_for_them() -> None:
+    code = """
+import sys
+from numba.core import caching
+for locator in (caching.InTreeCacheLocator, caching.UserWideCacheLocator, caching.UserProvidedCacheLocator):
+    locator.from_function = classmethod(lambda cls, function, path: None)
+from lidarpose.geometry.compiled import kernel
+
+@kernel
+def twice(x):
+    return 2.0 * x
+
+print(twice(3.0), twice.stats.cache_path)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["6.0", "None"]
+    assert done.stderr == ""
+
+
+def test_asking_for_little_imports_nothing() -> None:
+    code = "import sys; from lidarpose.geometry.compiled import pays; pays(1e-3); print('numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
