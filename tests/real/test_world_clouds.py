@@ -8,10 +8,14 @@ import pytest
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.detect.trihedral_corner import find_corners
 from lidarpose.geometry.arrays import FloatArray
-from lidarpose.model.corner_session import CornerPlace, MemoryCloud
+from lidarpose.geometry.rings import crossing_of_points
+from lidarpose.model.cloud import Cloud
+from lidarpose.model.corner_result import CornerCandidate
+from lidarpose.model.corner_session import CornerPlace, CrossingBeams, MemoryCloud
 from lidarpose.model.plane_patch import PlanePatch
-from lidarpose.refine.corner_model import frame_corners
+from lidarpose.refine.corner_model import FreeCorner, frame_corners
 from lidarpose.storage.clouds import read_cloud
+from lidarpose.storage.corner_session import FileCloud
 from lidarpose.storage.packets import read_packets
 from lidarpose.workflows.corner_target import PlaceCrop, fit_place, mask_of, place_corners, select_faces
 
@@ -32,26 +36,62 @@ def off_square_deg(patches: tuple[PlanePatch, ...]) -> FloatArray:
     return np.asarray(np.minimum(angles, 90.0 - angles))
 
 
-def test_a_still_carton_before_a_16_line_lidar() -> None:
+# VLP-16 user manual, table of vertical corrections: 11.2 mm at -15 degrees, 0.7 mm at -1. The ROS driver left them out
+# until June 2023; the frames are of November 2022.
+VLP16_CROSSING_M = 0.0419
+
+
+def carton() -> list[FloatArray]:
+    """The frames' points, with the beams put to where they start."""
     paths = sorted((folder("box_jimin") / "dataset").glob("*.pcd"))
-    clouds = [MemoryCloud(p.name, read_cloud(p)) for p in paths]
-    place = CornerPlace("carton", np.zeros(3), tuple(clouds))
+    sources = [CrossingBeams(FileCloud(p, p.name), VLP16_CROSSING_M) for p in paths]
+    return [s.load().finite().points.astype(np.float64) for s in sources]
+
+
+def free_corner(frames: list[FloatArray]) -> tuple[PlaceCrop, CornerCandidate, FreeCorner]:
+    """The carton's planes in all frames together, from the first of them unaided."""
+    place = CornerPlace("carton", np.zeros(3), (MemoryCloud("first", Cloud(frames[0].astype(np.float32))),))
     (candidate,) = place_corners(place)
     assert candidate.convex
-    points = [c.load().finite().points for c in clouds]
-    frame = np.repeat(np.arange(len(points)), [len(p) for p in points])
-    crop = PlaceCrop(np.concatenate(points).astype(np.float64), frame, len(points))
+    frame = np.repeat(np.arange(len(frames)), [len(p) for p in frames])
+    crop = PlaceCrop(np.concatenate(frames), frame, len(frames))
     fit = fit_place(crop, candidate, 0.008)
     assert fit is not None
+    return crop, candidate, fit
+
+
+def face_angles_deg(fit: FreeCorner) -> FloatArray:
+    return np.asarray(np.degrees(np.arccos((fit.normals @ fit.normals.T)[np.triu_indices(3, 1)])))
+
+
+def test_the_corner_of_a_still_carton_repeats_from_frame_to_frame() -> None:
+    frames = carton()
+    crop, candidate, fit = free_corner(frames)
     faces = select_faces(crop, mask_of(candidate, fit.corner, fit.normals), 6.5 * fit.sigma_m, fit.sigma_m)
     corners = frame_corners(faces, fit.normals, fit.corner, crop.frames, fit.sigma_m)
     scatter = np.median(np.abs(corners - np.median(corners, axis=0)), axis=0)
     assert scatter.max() < 0.5e-3
-    # The lines of this LiDAR are off by up to 12 mm each, all frames alike, and each face is met by five to eleven of
-    # them: averaging leaves the angles as wrong as those make them.
-    angles = np.degrees(np.arccos((fit.normals @ fit.normals.T)[np.triu_indices(3, 1)]))
-    assert np.abs(angles - 90.0).max() < 3.5
-    assert np.sort(np.abs(angles - 90.0))[1] < 1.5
+
+
+def test_the_faces_of_a_still_carton_are_square_after_twenty_frames() -> None:
+    # Nothing in the fit knows of right angles. Single lines of this LiDAR are off by 3 to 10 mm, all frames alike.
+    frames = carton()
+    for first in range(0, 80, 20):
+        assert np.abs(face_angles_deg(free_corner(frames[first : first + 20])[2]) - 90.0).max() < 1.5
+    assert np.abs(face_angles_deg(free_corner(frames)[2]) - 90.0).max() < 1.5
+
+
+def test_the_clouds_themselves_tell_whether_beams_were_put_to_where_they_start() -> None:
+    """The carton's driver let all beams start at one point; another one has them cross where the manual does."""
+    first = sorted((folder("box_jimin") / "dataset").glob("*.pcd"))[0]
+    together = crossing_of_points(read_cloud(first).finite().points)
+    assert together is not None
+    assert together[0] == pytest.approx(0.0, abs=1e-5)
+    pytest.importorskip("velodyne_decoder", reason="the extra packets is not installed")
+    turn = next(read_packets(folder("pcaps") / "sample_velodyne_vlp16_gps.pcap")).finite().points
+    apart = crossing_of_points(turn[np.linalg.norm(turn, axis=1) > 0.5])
+    assert apart is not None
+    assert apart[0] == pytest.approx(VLP16_CROSSING_M, abs=1e-4)
 
 
 def found_planes(points: FloatArray, seed: int = 0) -> tuple[PlanePatch, ...]:

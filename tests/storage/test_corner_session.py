@@ -83,3 +83,42 @@ def test_a_simulation_is_replaced_with_its_truth(folder: Path) -> None:
     write_corner_session(folder, session)
     assert len(read_corner_session(folder).places) == len(session.places)
     assert not folder.with_name(folder.name + ".truth.json").exists()
+
+
+def test_beams_are_put_to_where_they_cross(tmp_path: Path) -> None:
+    spec = CornerSceneSpec(lidar="vlp16", places=3, frames=1, room=True, seed=2)
+    session, _ = simulate_corner_session(spec)
+    write_corner_session(tmp_path / "s", session)
+    file = tmp_path / "s" / "session.toml"
+    file.write_text(file.read_text() + "beam_crossing_m = 0.0419\n")
+    again = read_corner_session(tmp_path / "s")
+    assert again.lidar.beam_crossing_m == pytest.approx(0.0419)
+    plain = session.places[0].clouds[0].load().points
+    moved = again.places[0].clouds[0].load().points
+    np.testing.assert_array_equal(moved[:, :2], plain[:, :2])
+    tangent = plain[:, 2] / np.hypot(plain[:, 0], plain[:, 1])
+    np.testing.assert_allclose(plain[:, 2] - moved[:, 2], 0.0419 * tangent, atol=2e-6)
+    # What is written is as it was read: the key goes.
+    write_corner_session(tmp_path / "t", again)
+    assert "beam_crossing" not in (tmp_path / "t" / "session.toml").read_text()
+
+
+def test_beams_are_not_put_to_their_crossing_twice(tmp_path: Path) -> None:
+    spec = CornerSceneSpec(lidar="vlp16", places=3, frames=1, room=True, seed=2)
+    write_corner_session(tmp_path / "s", simulate_corner_session(spec)[0])
+    file = tmp_path / "s" / "session.toml"
+    file.write_text(file.read_text() + "beam_crossing_m = 0.0419\n")
+    write_corner_session(tmp_path / "t", read_corner_session(tmp_path / "s"))
+    file = tmp_path / "t" / "session.toml"
+    file.write_text(file.read_text() + "beam_crossing_m = 0.0419\n")
+    twice = read_corner_session(tmp_path / "t")
+    with pytest.raises(InputError, match=r"cross 41\.9 mm before the axis already"):
+        twice.places[0].clouds[0].load()
+
+
+def test_a_crossing_is_for_clouds_of_a_multi_beam_lidar(folder: Path) -> None:
+    file = folder / "session.toml"
+    text = file.read_text().replace('cloud_frame = "lidar"', 'cloud_frame = "camera"')
+    file.write_text(text + "beam_crossing_m = 0.0419\n")
+    with pytest.raises(InputError, match="beam_crossing_m"):
+        read_corner_session(folder)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
+from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray, as_float_array
+from lidarpose.geometry.rings import crossing_of_points, with_beams_crossing
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.scan import LidarSpec
 
@@ -86,3 +88,31 @@ class MemoryCloud:
 
     def load(self) -> Cloud:
         return self.cloud
+
+
+@dataclass(frozen=True, eq=False)
+class CrossingBeams:
+    """Clouds of a multi-beam LiDAR with its beams put to where they start (see `lidarpose.geometry.rings`).
+
+    Whether that was done already, is seen in the points themselves; it is not done twice.
+    """
+
+    source: CloudSource
+    crossing_m: float
+
+    @property
+    def name(self) -> str:
+        return self.source.name
+
+    def load(self) -> Cloud:
+        cloud = self.source.load()
+        seen = crossing_of_points(cloud.finite().points)
+        if seen is not None and abs(seen[0]) > 0.1 * abs(self.crossing_m) + 5.0 * seen[1]:
+            raise InputError(
+                self.name,
+                f"has beams that cross {1e3 * seen[0]:.1f} mm before the axis already",
+                field="lidar.beam_crossing_m",
+                expected="clouds whose beams all start at one point",
+                remedy="Leave the key out: the driver has put the beams where they start.",
+            )
+        return replace(cloud, points=with_beams_crossing(cloud.points, self.crossing_m))

@@ -11,10 +11,18 @@ from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, as_float_
 
 @dataclass(frozen=True)
 class LidarSpec:
-    """What the user says of his LiDAR; both may be unknown."""
+    """What the user says of his LiDAR; all may be unknown.
+
+    Attributes
+    ----------
+    beam_crossing_m
+        Of a multi-beam LiDAR whose clouds are made as if all beams started at one point: how far before the axis they
+        cross in truth (see `lidarpose.geometry.rings`).
+    """
 
     model: str | None = None
     range_sigma_m: float | None = None
+    beam_crossing_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,7 +15,8 @@ from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.calibration import WorldCalibration
 from lidarpose.model.cloud import Cloud
-from lidarpose.model.corner_session import CornerPlace, CornerSession
+from lidarpose.model.corner_session import CornerPlace, CornerSession, CrossingBeams
+from lidarpose.model.scan import LidarSpec
 from lidarpose.storage.atomic import replacing_folder, restore_folder, write_text
 from lidarpose.storage.calibration import read_calibration
 from lidarpose.storage.documents import Schema, check_format, parse, read_toml, shown
@@ -34,13 +35,22 @@ _WORLD = ("world_x_m", "world_y_m", "world_z_m")
 _NEAR = ("near_x_m", "near_y_m", "near_z_m")
 
 
+class _LidarSection(LidarSection):
+    """[lidar] of a corner session."""
+
+    beam_crossing_m: Annotated[float, Field(gt=-0.2, lt=0.2)] | None = None
+
+    def spec(self) -> LidarSpec:
+        return replace(super().spec(), beam_crossing_m=self.beam_crossing_m)
+
+
 class _SessionFile(Schema):
     format: Literal["lidarpose/corner-session@1"]
     positions: str
     world_sigma_m: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     estimate_scale: bool = False
     cloud_frame: Literal["lidar", "camera"] = "lidar"
-    lidar: LidarSection = LidarSection()
+    lidar: _LidarSection = _LidarSection()
 
 
 @dataclass(frozen=True)
@@ -71,6 +81,16 @@ def read_corner_session(folder: Path) -> CornerSession:
         raise InputError(folder, problem, expected="a session's folder")
     document = parse(file, _SessionFile, check_format(file, read_toml(file), CORNER_SESSION_FORMAT))
     places = _read_places(folder, inside(folder, document.positions, file, "positions"))
+    crossing_m = document.lidar.beam_crossing_m
+    if crossing_m:
+        if document.cloud_frame != "lidar":
+            raise InputError(
+                file,
+                "is for clouds in the frame of a multi-beam LiDAR",
+                field="lidar.beam_crossing_m",
+                expected='cloud_frame = "lidar"',
+            )
+        places = tuple(_crossing(place, crossing_m) for place in places)
     return CornerSession(
         str(folder),
         places,
@@ -79,6 +99,10 @@ def read_corner_session(folder: Path) -> CornerSession:
         document.cloud_frame,
         document.lidar.spec(),
     )
+
+
+def _crossing(place: CornerPlace, crossing_m: float) -> CornerPlace:
+    return replace(place, clouds=tuple(CrossingBeams(source, crossing_m) for source in place.clouds))
 
 
 def _read_places(folder: Path, path: Path) -> tuple[CornerPlace, ...]:
@@ -198,7 +222,8 @@ def session_provenance(folder: Path, session: CornerSession, options: Mapping[st
     document = parse(folder / "session.toml", _SessionFile, read_toml(folder / "session.toml"))
     record = provenance("calibrate", folder, [folder / "session.toml", folder / document.positions], options)
     clouds = [source for place in session.places for source in place.clouds]
-    sizes = [source.path.stat().st_size for source in clouds if isinstance(source, FileCloud)]
+    files = [source.source if isinstance(source, CrossingBeams) else source for source in clouds]
+    sizes = [source.path.stat().st_size for source in files if isinstance(source, FileCloud)]
     return record | {"clouds": {"files": len(clouds), "bytes": sum(sizes)}}
 
 
