@@ -2,8 +2,8 @@
 
     python -m benchmarks.assemble [--sweeps 6000] [--beams 3240] [--stream-points 100000000]
 
-Prints one JSON object. Each pair is interleaved and the medians are compared, as the machine may be shared. Memory is
-the largest resident set of a process that streams the whole recording.
+Prints one JSON object. Every run stands between two of its reference, and the median of the ratios counts, as the
+machine may be shared. Memory is the largest resident set of a process that streams the whole recording.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
@@ -22,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.timing import beside, seconds
 from lidarpose.geometry.compiled import installed
 from lidarpose.geometry.se3 import Pose
 from lidarpose.measure.assemble import assemble
@@ -45,34 +45,24 @@ def recording(sweeps: int, beams: int) -> SweepRecording:
     return SweepRecording("bench", np.arange(sweeps) * 0.01, np.linspace(-45.0, 225.0, beams), ranges)
 
 
-def seconds(work: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
 def in_memory(sweeps: int, beams: int, repeats: int) -> dict[str, Any]:
     """Points a second of both ways and of a copy of the result."""
     source = recording(sweeps, beams)
     out = np.zeros((sweeps, beams, 3), dtype=np.float32)
     copy = np.zeros_like(out)
     ways: dict[str, Callable[[], Any]] = {
-        "copy": lambda: np.copyto(copy, out),
         "numpy": lambda: assemble(source, MOTION, out=out, compiled=False),
     }
     first: float | None = None
     if installed():
         first = seconds(lambda: assemble(source, MOTION, out=out, compiled=True))
         ways["compiled"] = lambda: assemble(source, MOTION, out=out, compiled=True)
-    times: dict[str, list[float]] = {name: [] for name in ways}
-    for _ in range(repeats):
-        for name, way in ways.items():
-            times[name].append(seconds(way))
-    millions = {name: sweeps * beams / median(t) / 1e6 for name, t in times.items()}
+    found = beside(lambda: np.copyto(copy, out), ways, repeats, least_s=0.2)
+    times = {"copy": found.reference_s, **found.seconds}
     return {
         "points": sweeps * beams,
-        "million_points_per_s": millions,
-        "ratio_to_copy": {name: rate / millions["copy"] for name, rate in millions.items()},
+        "million_points_per_s": {name: sweeps * beams / value / 1e6 for name, value in times.items()},
+        "time_over_copy": {"copy": 1.0, **found.over},
         "first_compiled_call_s": first,
     }
 
@@ -118,18 +108,29 @@ def streamed(points: int, beams: int, repeats: int) -> dict[str, Any]:
         root = Path(folder)
         write_recording(root / "rec", recording(points // beams, beams))
         write_calibration(root / "cal.json", TurntableCalibration(MOTION))
-        scan, raw, memory = [], [], 0.0
-        for _ in range(repeats):
-            scan.append(seconds(lambda: _run_scan(root)))
-            memory = max(memory, float((root / "memory").read_text()))
-            raw.append(seconds(lambda: _write_raw(root)))
-        return {
-            "points": points,
-            "scan_s": median(scan),
-            "raw_write_s": median(raw),
-            "ratio": median(scan) / median(raw),
-            "memory_mb": memory,
-        }
+        memory = []
+
+        def clean() -> None:
+            # New files and an idle disk: to replace a file and to write back an earlier one takes what it likes.
+            for name in ("cloud.ply", "raw"):
+                (root / name).unlink(missing_ok=True)
+            os.sync()
+
+        def scan() -> None:
+            _run_scan(root)
+            memory.append(float((root / "memory").read_text()))
+
+        scan()
+        size = (root / "cloud.ply").stat().st_size
+        # Each once beforehand: reading the recording from the disk is no part of it.
+        found = beside(lambda: _write_raw(root, size), {"scan": scan}, repeats, before_each=clean, least_s=0.5)
+    return {
+        "points": points,
+        "scan_s": found.seconds["scan"],
+        "raw_write_s": found.reference_s,
+        "ratio": found.over["scan"],
+        "memory_mb": max(memory),
+    }
 
 
 _CHILD = """
@@ -150,16 +151,12 @@ def _run_scan(root: Path) -> None:
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
-def _write_raw(root: Path) -> None:
-    """The bytes of the cloud from memory to a new file, flushed to the disk as the scan's are."""
+def _write_raw(root: Path, size: int) -> None:
+    """As many bytes from memory to a new file, in the page cache as the scan's: neither is flushed to the disk."""
     block = np.ones(12 << 20, dtype=np.uint8).data
-    size = (root / "cloud.ply").stat().st_size
     with (root / "raw").open("wb") as file:
         for start in range(0, size, len(block)):
             file.write(block[: min(len(block), size - start)])
-        file.flush()
-        os.fsync(file.fileno())
-    (root / "raw").unlink()
 
 
 def main() -> None:

@@ -1,7 +1,8 @@
 """`calibrate` for a turntable session of 87 places, against decoding its images alone on the same cores.
 
 Run by hand: ``python -m benchmarks.calibrate [SESSION]``. Without a session one is simulated and written to a temporary
-folder. The runs are interleaved, and what counts are the ratios of the medians. Decoding is OpenCV's, a thread a core.
+folder. Every run stands between two of decoding; what counts is the median of its ratios to them. Decoding is OpenCV's,
+a thread a core.
 """
 
 from __future__ import annotations
@@ -10,14 +11,13 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from statistics import median
 
 import cv2
 
+from benchmarks.timing import Contest, beside
 from lidarpose.report.turntable_page import turntable_page
 from lidarpose.storage.session import read_turntable_session
 from lidarpose.workflows.turntable import calibrate_turntable
@@ -56,24 +56,21 @@ def simulate(folder: Path, places: int = PLACES) -> None:
     subprocess.run([*arguments, "--quiet"], check=True)
 
 
-def measure(folder: Path, repeats: int = REPEATS) -> dict[str, float]:
-    """Median seconds of each way, all of them in turn."""
+DECODING = "decoding the images alone"
+
+
+def measure(folder: Path, repeats: int = REPEATS) -> Contest:
+    """Every way beside decoding, all of them in turn."""
     ways: dict[str, Callable[[], None]] = {
-        "decoding the images alone": lambda: decode(folder),
         "calibrate, modules loaded, no report": lambda: calibrate(folder, report=False),
         "calibrate, modules loaded, report": lambda: calibrate(folder, report=True),
         "lidarpose calibrate --no-report": lambda: command(folder, "--no-report"),
         "lidarpose calibrate": lambda: command(folder),
     }
-    seconds: dict[str, list[float]] = {name: [] for name in ways}
     calibrate(folder, report=True)
     command(folder)
-    for _ in range(repeats):
-        for name, way in ways.items():
-            started = time.perf_counter()
-            way()
-            seconds[name].append(time.perf_counter() - started)
-    return {name: median(values) for name, values in seconds.items()}
+    decode(folder)
+    return beside(lambda: decode(folder), ways, repeats)
 
 
 def main() -> None:
@@ -83,10 +80,10 @@ def main() -> None:
         if len(sys.argv) == 1:
             simulate(folder)
         found = measure(folder)
-    first = next(iter(found.values()))
     print(f"{'':40s} {'seconds':>8s} {'ratio':>6s}")
-    for name, value in found.items():
-        print(f"{name:40s} {value:8.2f} {value / first:6.2f}")
+    print(f"{DECODING:40s} {found.reference_s:8.2f} {1.0:6.2f}")
+    for name, value in found.seconds.items():
+        print(f"{name:40s} {value:8.2f} {found.over[name]:6.2f}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""One job of one size in a process of its own: seconds and memory, for the growth suite.
+"""How one job grows, for the growth suite: memory of one size in a process of its own, or the time of all sizes.
 
-python -m benchmarks.growing {places,frames,points,assembled,written} SIZE [SESSION]
+python -m benchmarks.growing memory {places,frames,points,assembled,written} SIZE SESSION
+python -m benchmarks.growing time {places,frames,points,assembled,written} SIZE,SIZE,... SESSION ROUNDS
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.timing import Work, peak_of
+from benchmarks.timing import Work, peak_of, processor_seconds
 
 
 def places(size: int, session: Path) -> tuple[Work, Work]:
@@ -85,13 +86,35 @@ JOBS: dict[str, Callable[[int, Path], tuple[Work, Work]]] = {
 }
 
 
-def main() -> None:
-    name, size, session = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3] if len(sys.argv) > 3 else ".")
+# Jobs shorter than this are done several times: the system counts processor time in steps.
+LEAST_S = 0.1
+
+
+def memory(name: str, size: int, session: Path) -> float:
+    """MB above the input."""
     warm, work = JOBS[name](size, session)
     # Imports, caches and thread pools are no part of how the work grows.
     warm()
-    seconds, megabytes = peak_of(work)
-    print(json.dumps({"seconds": seconds, "megabytes": megabytes}))
+    return peak_of(work)[1]
+
+
+def rounds(name: str, sizes: list[int], session: Path, repeats: int) -> list[list[float]]:
+    """Processor seconds of every size, all of them in turn, after a round that makes the process warm."""
+    works = [JOBS[name](size, session)[1] for size in sizes]
+    calls = [max(1, round(LEAST_S / max(processor_seconds(work), 1e-4))) for work in works]
+
+    def each(work: Work, times: int) -> float:
+        return processor_seconds(lambda: [work() for _ in range(times)]) / times
+
+    return [[each(work, times) for work, times in zip(works, calls, strict=True)] for _ in range(repeats)]
+
+
+def main() -> None:
+    what, name, sizes, session = sys.argv[1:5]
+    if what == "memory":
+        print(json.dumps(memory(name, int(sizes), Path(session))))
+    else:
+        print(json.dumps(rounds(name, [int(size) for size in sizes.split(",")], Path(session), int(sys.argv[5]))))
 
 
 if __name__ == "__main__":

@@ -22,6 +22,8 @@ class Metric:
         "x" for a ratio.
     tolerance
         Two runs on one idle machine differ by less than this share of the value.
+    absolute
+        The tolerance is no share but a difference: for exponents, where a share of nearly nothing is nothing.
     target
         At most this where lower is better, at least this where higher is; None where nothing is asked.
     bound
@@ -35,6 +37,7 @@ class Metric:
     target: float | None = None
     better: Better = "lower"
     bound: str = ""
+    absolute: bool = False
 
     def met(self, value: float) -> bool | None:
         """Whether a value reaches the target; None without one."""
@@ -44,7 +47,16 @@ class Metric:
 
     def agrees(self, first: float, second: float) -> bool:
         """Whether two runs gave the same figure within the tolerance."""
-        return abs(first - second) <= self.tolerance * max(abs(first), abs(second))
+        return abs(first - second) <= self.tolerance * (1.0 if self.absolute else max(abs(first), abs(second)))
+
+    @property
+    def tolerance_text(self) -> str:
+        """The tolerance for a reader."""
+        return f"± {self.tolerance:g}" if self.absolute else f"{100 * self.tolerance:.0f} %"
+
+
+def _exponent(key: str, what: str) -> Metric:
+    return Metric(key, what, "", 0.15, 1.1, absolute=True)
 
 
 _PLANES = (
@@ -134,12 +146,12 @@ METRICS: tuple[Metric, ...] = (
     # The world
     Metric("world.reading", "`calibrate` of 120 HDL-32 frames, over reading them", "x", 0.3, 2.0, bound=_FRAMES),
     # Growth
-    Metric("growth.places_s", "exponent of calibrate's time over places", "", 0.3, 1.1),
-    Metric("growth.places_mb", "exponent of its memory over places", "", 0.5, 1.1),
-    Metric("growth.frames_s", "exponent of the world job's time over frames", "", 0.3, 1.1),
-    Metric("growth.frames_mb", "exponent of its memory over frames", "", 0.5, 1.1),
-    Metric("growth.points_s", "exponent of plane segmentation's time over points", "", 0.3, 1.1),
-    Metric("growth.points_mb", "exponent of its memory over points", "", 0.3, 1.1),
+    _exponent("growth.places_s", "exponent of calibrate's processor time over places"),
+    _exponent("growth.places_mb", "exponent of its memory over places"),
+    _exponent("growth.frames_s", "exponent of the world job's processor time over frames"),
+    _exponent("growth.frames_mb", "exponent of its memory over frames"),
+    _exponent("growth.points_s", "exponent of plane segmentation's processor time over points"),
+    _exponent("growth.points_mb", "exponent of its memory over points"),
     # Accuracy, on simulated observations: seeded, so that only rounding may differ from run to run
     Metric("turntable.joint_mm", "joint estimate's centre, over the Cramer-Rao bound", "x", 0.02, 1.1),
     Metric("turntable.joint_deg", "its rotation, over the Cramer-Rao bound", "x", 0.02, 1.1),

@@ -38,12 +38,17 @@ class Curve:
 
 @dataclass(frozen=True)
 class Report:
-    """One suite's outcome. `figures`: by the metric's key, what was measured; a figure may be missing."""
+    """One suite's outcome.
+
+    `figures`: by the metric's key, what was measured; a figure may be missing. `pace_s`: median seconds of
+    `timing.pace` during the suite, where it has figures in seconds.
+    """
 
     figures: Mapping[str, float]
     tables: Sequence[Table] = ()
     curves: Sequence[Curve] = ()
     notes: Sequence[str] = field(default=())
+    pace_s: float | None = None
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)

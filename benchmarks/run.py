@@ -120,7 +120,11 @@ def compare(before: dict[str, Any], now: dict[str, Any]) -> Comparison:
     unjudged: list[str] = []
     for key in sorted(old.keys() & new.keys()):
         metric = BY_KEY[key]
-        line = f"{key}: {old[key]:.3g} before, {new[key]:.3g} now; tolerance {100 * metric.tolerance:.0f} %"
+        line = f"{key}: {old[key]:.3g} before, {new[key]:.3g} now; tolerance {metric.tolerance_text}"
+        if metric.unit in ("s", "ms"):
+            slower = _slower(before, now, key)
+            new[key] /= slower
+            line += f", held against each other on a machine {slower:.2f} times as slow"
         if metric.unit in ("s", "ms") and (busy(before) or busy(now)):
             unjudged.append(line)
         elif metric.agrees(old[key], new[key]):
@@ -129,6 +133,14 @@ def compare(before: dict[str, Any], now: dict[str, Any]) -> Comparison:
             (better if (new[key] < old[key]) == (metric.better == "lower") else worse).append(line)
     alone = [f"{key}: {'before' if key in old else 'now'}" for key in sorted(asked & (old.keys() ^ new.keys()))]
     return Comparison(agree, better, worse, alone, unjudged)
+
+
+def _slower(before: dict[str, Any], now: dict[str, Any], key: str) -> float:
+    """How many times as long the fixed piece of work took in the suite of a figure; 1 where a run did not time it."""
+    runs = (before, now)
+    suites = [next(suite for suite in run["suites"].values() if key in suite["figures"]) for run in runs]
+    first, second = (suite.get("pace_s") for suite in suites)
+    return second / first if first and second else 1.0
 
 
 def main() -> None:

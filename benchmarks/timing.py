@@ -1,17 +1,22 @@
-"""Seconds and memory, measured so that a busy machine disturbs all contestants alike."""
+"""Seconds and memory, measured so that a busy machine, or one whose speed varies, disturbs all contestants alike."""
 
 from __future__ import annotations
 
 import json
+import resource
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 Work = Callable[[], object]
+# Runs shorter than this are repeated and averaged: a single one is a matter of luck.
+LEAST_S = 0.05
+MOST_CALLS = 50
 
 
 def seconds(work: Work) -> float:
@@ -19,6 +24,18 @@ def seconds(work: Work) -> float:
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
+
+
+def processor_seconds(work: Work) -> float:
+    """Processor time of one call, that of ended child processes included: other processes take only the wall's."""
+    start = _processor_s()
+    work()
+    return _processor_s() - start
+
+
+def _processor_s() -> float:
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
 def interleaved(ways: Mapping[str, Work], repeats: int, *, budget_s: float = 20.0) -> dict[str, float]:
@@ -29,9 +46,93 @@ def interleaved(ways: Mapping[str, Work], repeats: int, *, budget_s: float = 20.
     times: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(repeats):
         for name, way in ways.items():
-            if not times[name] or sum(times[name]) + times[name][-1] <= budget_s:
+            if _within(times[name], budget_s):
                 times[name].append(seconds(way))
     return {name: median(values) for name, values in times.items()}
+
+
+@dataclass(frozen=True)
+class Contest:
+    """Several ways held against a reference.
+
+    Attributes
+    ----------
+    reference_s
+        Median seconds of the reference.
+    seconds
+        Median seconds of each way.
+    over
+        Of each way the median of its time over the reference's, runs just before and just after it: a machine that is
+        slow for a minute is slow for both.
+    """
+
+    reference_s: float
+    seconds: dict[str, float]
+    over: dict[str, float]
+
+
+def beside(
+    reference: Work,
+    ways: Mapping[str, Work],
+    repeats: int,
+    *,
+    budget_s: float = 20.0,
+    before_each: Callable[[], object] = lambda: None,
+    least_s: float = LEAST_S,
+) -> Contest:
+    """Time ways between runs of a reference, all of them in turn, `repeats` times.
+
+    Nothing is run beforehand: call what must be warm before. A slow way stops after `budget_s` of its own.
+
+    Parameters
+    ----------
+    before_each
+        Called before every run and not timed, to remove what the last one left.
+    least_s
+        A run is repeated until it has taken this long.
+    """
+
+    def timed(work: Work) -> float:
+        total, calls = 0.0, 0
+        while not calls or (total < least_s and calls < MOST_CALLS):
+            before_each()
+            total += seconds(work)
+            calls += 1
+        return total / calls
+
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    over: dict[str, list[float]] = {name: [] for name in ways}
+    references = [timed(reference)]
+    for _ in range(repeats):
+        for name, way in ways.items():
+            if _within(times[name], budget_s):
+                times[name].append(timed(way))
+                references.append(timed(reference))
+                over[name].append(2.0 * times[name][-1] / (references[-2] + references[-1]))
+    return Contest(
+        median(references),
+        {name: median(values) for name, values in times.items()},
+        {name: median(values) for name, values in over.items()},
+    )
+
+
+def _within(times: Sequence[float], budget_s: float) -> bool:
+    return not times or sum(times) + times[-1] <= budget_s
+
+
+def pace() -> float:
+    """A fixed piece of work, some hundredths of a second of Python and NumPy.
+
+    How long it takes while a suite runs says how fast the machine was then; seconds of two runs are compared by it.
+    """
+    import numpy as np
+
+    values = np.linspace(0.0, 1.0, 20_000)
+    total = 0.0
+    for k in range(100):
+        total += float(np.sort(np.sin(values * k))[k])
+        total += sum(i & k for i in range(1000))
+    return total
 
 
 def peak_of(work: Work) -> tuple[float, float]:

@@ -9,16 +9,15 @@ from benchmarks.report import Effort, Report, Table
 def run(effort: Effort) -> Report:
     sweeps, beams = effort.pick(6000, 600), 3240
     memory = in_memory(sweeps, beams, effort.pick(9, 3))
-    stream = streamed(effort.pick(50_000_000, 2_000_000), beams, effort.pick(2, 1))
-    rates = memory["million_points_per_s"]
+    stream = streamed(effort.pick(50_000_000, 2_000_000), beams, effort.pick(5, 1))
+    rates, over = memory["million_points_per_s"], memory["time_over_copy"]
     # Without numba the NumPy way is what a user has.
-    best = max(rate for name, rate in rates.items() if name != "copy")
     figures = {
-        "assemble.copy": rates["copy"] / best,
+        "assemble.copy": min(ratio for name, ratio in over.items() if name != "copy"),
         "assemble.stream": stream["ratio"],
         "assemble.stream_mb": stream["memory_mb"],
     }
-    rows: list[list[object]] = [[name, rate, rates["copy"] / rate] for name, rate in rates.items()]
+    rows: list[list[object]] = [[name, rate, over[name]] for name, rate in rates.items()]
     text = f"{memory['points']} points in memory, float32; assembling on all cores, the copy as NumPy makes it."
     # After the runs above have stored the kernels: the same small work with and without them on the disk.
     first, compiling = one_shot(100 * beams, beams)[1], first_compiling(beams)

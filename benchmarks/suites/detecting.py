@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.detection import corner_error, rig_panel, sector_with_accuracy, stripe_error, true_corners
 from benchmarks.report import Effort, Report, Table
-from benchmarks.timing import interleaved
+from benchmarks.timing import Work, beside, pace
 from lidarpose.detect.chessboard import find_panels
 from lidarpose.detect.laser_stripe import StripeFinder
 from lidarpose.simulate.rig import TurntableRig, draw_rig
@@ -20,7 +20,8 @@ Image = np.ndarray
 
 
 def run(effort: Effort) -> Report:
-    boards, stripes, errors = [], [], []
+    boards, stripes, errors, paces = [], [], [], []
+    pace()
     megapixels = 0.0
     for seed in range(effort.pick(4, 1)):
         rig = draw_rig(seed)
@@ -31,19 +32,20 @@ def run(effort: Effort) -> Report:
         images = {k: source.load() for k, source in sources.items() if source is not None}
         megapixels = shots[0].size / 1e6
         boards.append(_boards(rig, shots[0], effort.pick(5, 1)))
-        stripe, error = _stripes(rig, shots, images, effort.pick(5, 1))
+        stripe, took, error = _stripes(rig, shots, images, effort.pick(5, 1))
         stripes.append(stripe)
+        paces.append(took)
         errors.append(error)
-    ours_s, theirs_s, ours_px, theirs_px = np.median(np.array(boards), axis=0)
-    finding, alone, decoding = np.median(np.array(stripes), axis=0)
+    ours_s, theirs_s, theirs_over, ours_px, theirs_px = np.median(np.array(boards), axis=0)
+    finding, alone, decoding, over = np.median(np.array(stripes), axis=0)
     stripe_px = float(np.mean(np.abs(np.concatenate(errors))))
     figures = {
         "boards.s": float(ours_s),
         "boards.error": float(ours_px / theirs_px),
-        "boards.time": float(ours_s / theirs_s),
+        "boards.time": 1.0 / float(theirs_over),
         "stripes.ms": 1e3 * float(finding),
         "stripes.ms_per_megapixel": 1e3 * float(finding) / megapixels,
-        "stripes.decoding": float(finding / decoding),
+        "stripes.decoding": float(over),
     }
     rows = [
         ["lidarpose", 1e3 * float(ours_s), f"{ours_px:.4f}"],
@@ -60,21 +62,22 @@ def run(effort: Effort) -> Report:
             Table("Both boards of an image", ["detector", "ms", "RMS error of a coordinate, px"], rows, about),
             Table("Stripes", [together, "one alone", "decoding the PNG", "mean error, px"], lines, _ONE_THREAD),
         ],
+        pace_s=float(np.median(paces)),
     )
 
 
 _ONE_THREAD = "One thread; `calibrate` gives each core its own images."
 
 
-def _boards(rig: TurntableRig, image: Image, repeats: int) -> tuple[float, float, float, float]:
-    """Seconds and RMS error in pixels, ours and OpenCV's."""
-    times = interleaved(
-        {"ours": lambda: find_panels([image], rig.panels), "theirs": lambda: sector_with_accuracy(image, rig)}, repeats
+def _boards(rig: TurntableRig, image: Image, repeats: int) -> tuple[float, ...]:
+    """Seconds, ours and OpenCV's, OpenCV's over ours, and RMS error in pixels, ours and OpenCV's."""
+    found = beside(
+        lambda: find_panels([image], rig.panels), {"theirs": lambda: sector_with_accuracy(image, rig)}, repeats
     )
     truths = true_corners(rig)
     mine = [corner_error(c.pixels, truths) for c in find_panels([image], rig.panels).corners]
     sector = [corner_error(pixels, truths) for pixels in sector_with_accuracy(image, rig)]
-    return times["ours"], times["theirs"], _rms(mine), _rms(sector)
+    return found.reference_s, found.seconds["theirs"], found.over["theirs"], _rms(mine), _rms(sector)
 
 
 def _rms(values: list[float]) -> float:
@@ -83,25 +86,26 @@ def _rms(values: list[float]) -> float:
 
 def _stripes(
     rig: TurntableRig, shots: list[Image], images: dict[int, Image], repeats: int
-) -> tuple[tuple[float, float, float], np.ndarray]:
-    """Median seconds an image, several at once and one alone, and of decoding its PNG; and all errors in pixels."""
+) -> tuple[tuple[float, ...], float, np.ndarray]:
+    """Median seconds an image, several at once and one alone, and of decoding its PNG, and the first over the last;
+    how long the fixed piece of work took meanwhile; and all errors in pixels."""
     board = find_panels(shots, rig.panels)
     finder = StripeFinder(board, shots)
     batch = list(images.values())
     encoded = [cv2.imencode(".png", image)[1] for image in batch]
     found = finder.find_in(batch)
-    times = interleaved(
-        {
-            "batch": partial(finder.find_in, batch),
-            "one": lambda: [finder.find(image) for image in batch],
-            "decode": lambda: [cv2.imdecode(code, cv2.IMREAD_GRAYSCALE) for code in encoded],
-        },
-        repeats,
-    )
+    ways: dict[str, Work] = {
+        "batch": partial(finder.find_in, batch),
+        "one": lambda: [finder.find(image) for image in batch],
+        "pace": pace,
+    }
+    times = beside(lambda: [cv2.imdecode(code, cv2.IMREAD_GRAYSCALE) for code in encoded], ways, repeats)
     errors = [
         stripe_error(rig, place, rig_panel(rig, board, k), points)
         for place, detection in zip(images, found, strict=True)
         for k, points in detection.stripes.items()
     ]
     n = len(batch)
-    return (times["batch"] / n, times["one"] / n, times["decode"] / n), np.concatenate(errors)
+    own = times.seconds
+    figures = (own["batch"] / n, own["one"] / n, times.reference_s / n, times.over["batch"])
+    return figures, own["pace"], np.concatenate(errors)

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.peers.cloud_planes import open3d_planes, open3d_planes_of_subsample, pyransac3d_planes
 from benchmarks.report import Cell, Effort, Report, Table
-from benchmarks.timing import interleaved
+from benchmarks.timing import beside
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.geometry.arrays import FloatArray, angle_between, unit
 
@@ -86,10 +86,10 @@ def run(effort: Effort) -> Report:
         rows: list[list[Cell]] = []
         # Five million points with a small face say no more than 700 thousand do, and take minutes.
         for n in sizes if small is None else sizes[:2]:
-            seconds, errors = contest(n, small, effort)
-            rows += [_row(n, name, seconds, errors) for name in seconds]
+            seconds, over, errors = contest(n, small, effort)
+            rows += [_row(n, name, seconds[name], over[name], errors[name]) for name in seconds]
             if n == asked:
-                figures |= _figures(small, seconds, errors)
+                figures |= _figures(small, over, errors)
         name = "three like faces" if small is None else f"one face with {100 * small:.0f} % of the points"
         columns = ["points", "contestant", "s", "over ours", "normals, deg RMS", "worst face, deg", "faces found"]
         tables.append(Table(f"Planes of a cloud: {name}", columns, rows, _TEXT if small is None else ""))
@@ -106,19 +106,19 @@ _TEXT = (
 
 def contest(
     n: int, small: float | None, effort: Effort
-) -> tuple[dict[str, float | None], dict[str, FloatArray | None]]:
-    """Median seconds of each contestant on the first seed, and errors (seeds, 3) in degrees over all of them."""
-    seconds: dict[str, float | None] = {}
+) -> tuple[dict[str, float | None], dict[str, float | None], dict[str, FloatArray | None]]:
+    """On the first seed median seconds and their ratios to ours; errors (seeds, 3) in degrees over all seeds."""
     errors: dict[str, FloatArray | None] = {}
     contestants = ways(n, effort.quick)
     here = {name: way for name, way in contestants.items() if way is not None}
     points, truths = scene(n, small, SEEDS[0])
     first: dict[str, FloatArray] = {}
     works = {name: partial(_keep, first, name, way, points) for name, way in here.items()}
-    here[OURS](points)
-    measured = interleaved(works, effort.pick(5 if n < 1_000_000 else 3, 2), budget_s=8.0)
+    reference = works.pop(OURS)
+    reference()
+    found = beside(reference, works, effort.pick(5 if n < 1_000_000 else 3, 2), budget_s=8.0, least_s=0.2)
+    measured = {OURS: found.reference_s, **found.seconds}
     for name in contestants:
-        seconds[name] = measured.get(name)
         errors[name] = np.array([errors_deg(first[name], truths)]) if name in first else None
     for seed in SEEDS[1 : effort.pick(3, 1)] if n < 1_000_000 else ():
         points, truths = scene(n, small, seed)
@@ -126,28 +126,28 @@ def contest(
             known = errors[name]
             if known is not None and (measured[name] < 6.0 or n < 100_000):
                 errors[name] = np.vstack([known, errors_deg(way(points), truths)])
-    return seconds, errors
+    over = {OURS: 1.0, **found.over}
+    return {name: measured.get(name) for name in contestants}, {name: over.get(name) for name in contestants}, errors
 
 
 def _keep(found: dict[str, FloatArray], name: str, way: Callable[[FloatArray], FloatArray], points: FloatArray) -> None:
     found[name] = way(points)
 
 
-def _row(n: int, name: str, seconds: dict[str, float | None], errors: dict[str, FloatArray | None]) -> list[Cell]:
-    own, e, base = seconds[name], errors[name], seconds[OURS]
-    if own is None or e is None or base is None:
+def _row(n: int, name: str, seconds: float | None, over: float | None, e: FloatArray | None) -> list[Cell]:
+    if seconds is None or e is None:
         return [n, name, None, None, None, None, None]
     rms, worst = float(np.sqrt((e**2).mean())), float(e.max())
-    return [n, name, own, own / base, f"{rms:.4f}", f"{worst:.4f}", f"{np.count_nonzero(e < 2.0)} of {e.size}"]
+    return [n, name, seconds, over, f"{rms:.4f}", f"{worst:.4f}", f"{np.count_nonzero(e < 2.0)} of {e.size}"]
 
 
 def _figures(
-    small: float | None, seconds: dict[str, float | None], errors: dict[str, FloatArray | None]
+    small: float | None, over: dict[str, float | None], errors: dict[str, FloatArray | None]
 ) -> dict[str, float]:
     """The metrics of the size that the targets are about."""
     peers = {name: e for name, e in errors.items() if name != OURS and e is not None}
-    mine, base = errors[OURS], seconds[OURS]
-    if mine is None or base is None or not peers:
+    mine = errors[OURS]
+    if mine is None or not peers:
         return {}
     if small is not None:
         best = min(float(e.max()) for e in peers.values())
@@ -156,7 +156,7 @@ def _figures(
     found = {"planes.error": float(np.sqrt((mine**2).mean())) / best}
     keys = {OPEN3D: "planes.open3d", OPEN3D_1000: "planes.open3d_1000", SUBSAMPLE: "planes.subsample"}
     for name, key in {**keys, PYRANSAC3D: "planes.pyransac3d"}.items():
-        own = seconds.get(name)
-        if own is not None:
-            found[key] = own / base
+        ratio = over.get(name)
+        if ratio is not None:
+            found[key] = ratio
     return found

@@ -8,16 +8,17 @@ from benchmarks.metrics import BY_KEY, METRICS, Metric
 from benchmarks.page import markdown, page
 from benchmarks.report import Curve, Report, Table
 from benchmarks.run import SUITES, compare
-from benchmarks.timing import exponent, interleaved
+from benchmarks.timing import beside, exponent, interleaved, processor_seconds
 
 from lidarpose.simulate.rig import draw_rig
 
 
-def results(value: float, load: float = 0.1) -> dict[str, Any]:
+def results(value: float, load: float = 0.1, pace_s: float | None = None) -> dict[str, Any]:
     report = Report(
         {"start.help_s": value},
         [Table("Starting", ["process", "s"], [["lidarpose", 0.1234], ["open3d", None]])],
         [Curve("drawn", "Drawn", "size", "s", [1.0, 10.0], {"ours": [0.1, 1.0], "theirs": [float("nan"), 3.0]})],
+        pace_s=pace_s,
     )
     machine = {"cores": 2, "load": load, "versions": {"Python": "3.11"}}
     return {"machine": machine, "quick": False, "suites": {"starting": report.as_json()}}
@@ -64,6 +65,24 @@ def test_two_runs_are_compared_within_the_tolerance() -> None:
     assert not faster.worse
 
 
+def test_seconds_are_compared_in_units_of_the_pace() -> None:
+    # A machine half as fast: twice the seconds are the same figure, and the same seconds a better one.
+    before, now = results(0.1, pace_s=0.03), results(0.2, pace_s=0.06)
+    assert compare(before, now).agree == 1
+    assert len(compare(before, results(0.1, pace_s=0.06)).better) == 1
+    assert len(compare(before, results(0.2, pace_s=0.03)).worse) == 1
+    # An earlier run without it is compared as it is.
+    assert len(compare(results(0.1), now).worse) == 1
+
+
+def test_an_exponent_is_held_to_a_difference() -> None:
+    metric = BY_KEY["growth.frames_mb"]
+    assert metric.tolerance_text == "± 0.15"
+    assert metric.agrees(0.02, 0.12)
+    assert not metric.agrees(0.02, 0.22)
+    assert "± 0.15 |" in page(results(0.1))
+
+
 def test_what_cannot_be_compared_is_said() -> None:
     seconds_of_a_busy_machine = compare(results(0.1), results(0.9, load=7.0))
     assert not seconds_of_a_busy_machine.worse
@@ -96,6 +115,48 @@ def test_ways_are_interleaved_and_a_slow_one_stops() -> None:
     order.clear()
     interleaved({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 3, budget_s=0.0)
     assert order == ["a", "b"]
+
+
+def test_each_way_stands_between_two_runs_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A clock of its own: the machine gets slower by a tenth with each run, the way takes three times the reference.
+    order: list[str] = []
+    now = 0.0
+
+    def work(name: str, cost: float) -> None:
+        nonlocal now
+        order.append(name)
+        now += cost * 1.1 ** len([one for one in order if one != "clean"])
+
+    monkeypatch.setattr("benchmarks.timing.time.perf_counter", lambda: now)
+    found = beside(
+        lambda: work("reference", 1.0),
+        {"way": lambda: work("way", 3.0)},
+        2,
+        before_each=lambda: order.append("clean"),
+        least_s=0.0,
+    )
+    assert order == ["clean", "reference", *["clean", "way", "clean", "reference"] * 2]
+    assert found.over["way"] == pytest.approx(3.0, rel=0.01)
+    assert found.seconds["way"] > 3.0
+
+
+def test_short_runs_beside_a_reference_are_repeated() -> None:
+    counted = {"reference": 0, "way": 0}
+
+    def work(name: str) -> None:
+        counted[name] += 1
+
+    beside(lambda: work("reference"), {"way": lambda: work("way")}, 1, least_s=1.0)
+    assert counted == {"reference": 100, "way": 50}
+
+
+def test_processor_time_holds_that_of_child_processes() -> None:
+    import subprocess
+    import sys
+
+    child = [sys.executable, "-c", "import time\nwhile time.process_time() < 0.2: pass"]
+    assert processor_seconds(lambda: subprocess.run(child, check=True)) > 0.15
+    assert processor_seconds(lambda: None) < 0.1
 
 
 def test_exponents_of_powers() -> None:
