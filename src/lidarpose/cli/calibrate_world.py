@@ -151,6 +151,12 @@ def summary_lines(calibration: WorldCalibration) -> list[str]:
         lines.append(f"scale: {calibration.scale:.6f}")
     if "range_sigma_mm" in figures:
         lines.append(f"range noise found: {figures['range_sigma_mm']:.2f} mm")
+    if "ring_sigma_mm" in figures:
+        largest = max(figures["ring_offsets_mm"].items(), key=lambda item: abs(item[1]))
+        lines.append(
+            f"rings are off by {figures['ring_sigma_mm']:.1f} mm (standard deviation), corrected; most the one at "
+            f"{largest[0]} deg, {largest[1]:+.1f} mm"
+        )
     return lines
 
 

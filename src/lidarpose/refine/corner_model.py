@@ -80,6 +80,8 @@ class CornerFit:
         Noise of the ranges as the residuals show it.
     systems
         By (place, face): the collapsed systems at the solution.
+    loss_factor
+        What the loss costs: the covariance over the inverse of the information with weights.
     """
 
     state: CornerState
@@ -91,6 +93,12 @@ class CornerFit:
     world_sigma_m: float
     steps: int
     returns: int
+    loss_factor: float = 1.0
+
+    @property
+    def options(self) -> CornerOptions:
+        """What was estimated."""
+        return CornerOptions(self.world_sigma_m, "log_scale" in self.names)
 
     @property
     def pose_covariance(self) -> FloatArray:
@@ -166,11 +174,21 @@ def _loss_terms(residual: FloatArray, sigma_m: float) -> tuple[FloatArray, Float
 
 
 def _system(face: _Face, normal: FloatArray, corner: FloatArray, sigma_m: float) -> FaceSystem:
-    expected, rows = _rows(face.returns.rays, normal, corner)
-    face.residual = face.returns.range_m - expected
-    weight = _weights(face.residual, sigma_m)
-    weighted = rows * (weight / sigma_m**2)
-    return FaceSystem(weighted @ rows.T, weighted @ face.residual, float(weight.sum()))
+    face.residual, rows, weight = weighted_rows(face.returns, normal, corner, sigma_m)
+    weighted = rows * weight
+    return FaceSystem(weighted @ rows.T, weighted @ face.residual, float(weight.sum()) * sigma_m**2)
+
+
+def weighted_rows(
+    returns: FaceReturns, normal: FloatArray, corner: FloatArray, sigma_m: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Measured minus expected ranges (N,), the derivatives (3, N) of the expected ones by the plane's shift and its two
+    tilts about the corner, and the weights (N,), one over the noise squared times the loss's own."""
+    expected, rows = _rows(returns.rays, normal, corner)
+    residual = returns.range_m - expected
+    weight = _weights(residual, sigma_m)
+    weight *= 1.0 / sigma_m**2
+    return residual, rows, weight
 
 
 def _wide_enough(sigma_m: float, residuals: Sequence[FloatArray]) -> float:
@@ -300,18 +318,18 @@ def fit_corner_model(
         if delta @ information @ delta < settled**2 and step > 1:
             break
     information, _, systems = _assemble(faces, state, world, sigma_m, options)
-    residuals = np.concatenate([f.residual for f in faces])
-    covariance = np.linalg.inv(information) * _loss_factor(residuals, sigma_m)
+    loss_factor = _loss_factor(np.concatenate([f.residual for f in faces]), sigma_m)
     return CornerFit(
         state,
         names,
-        covariance,
+        np.linalg.inv(information) * loss_factor,
         sigma_m,
         systems,
         world,
         options.world_sigma_m,
         step,
         sum(len(f.returns) for f in faces),
+        loss_factor,
     )
 
 
@@ -367,20 +385,36 @@ def _assemble(
     return *_joined(systems, state, world, options), systems
 
 
+def face_jacobians(
+    faces: Sequence[tuple[int, int]], state: CornerState, world: FloatArray, options: CornerOptions
+) -> dict[tuple[int, int], FloatArray]:
+    """By (place, face): the derivative (3, n) of the plane's shift and two tilts by the estimate's parameters."""
+    tilts, _, width = _columns(len(world), options)
+    corners = state.corners(world)
+    of_corner = {i: _corner_jacobian(state, world, i, corners[i], options) for i, _ in faces}
+    jacobians: dict[tuple[int, int], FloatArray] = {}
+    for place, face in faces:
+        B = np.zeros((3, width))
+        B[0] = state.normals[face] @ of_corner[place]
+        B[1:, tilts + 2 * face : tilts + 2 * face + 2] = np.eye(2)
+        jacobians[place, face] = B
+    return jacobians
+
+
+def joint_information(fit: CornerFit, systems: Mapping[tuple[int, int], FaceSystem]) -> tuple[FloatArray, FloatArray]:
+    """Information (n, n) and gradient (n,) of an estimate's parameters from other systems than its own."""
+    return _joined(systems, fit.state, fit.world, fit.options)
+
+
 def _joined(
     systems: Mapping[tuple[int, int], FaceSystem], state: CornerState, world: FloatArray, options: CornerOptions
 ) -> tuple[FloatArray, FloatArray]:
     """The normal equations of the whole, from each face's own."""
-    tilts, errors, width = _columns(len(world), options)
+    _, errors, width = _columns(len(world), options)
     information, gradient = np.zeros((width, width)), np.zeros(width)
-    corners = state.corners(world)
-    jacobians = [_corner_jacobian(state, world, i, corners[i], options) for i in range(len(world))]
-    for (place, face), system in systems.items():
-        B = np.zeros((3, width))
-        B[0] = state.normals[face] @ jacobians[place]
-        B[1:, tilts + 2 * face : tilts + 2 * face + 2] = np.eye(2)
-        information += B.T @ system.information @ B
-        gradient += B.T @ system.gradient
+    for key, B in face_jacobians(list(systems), state, world, options).items():
+        information += B.T @ systems[key].information @ B
+        gradient += B.T @ systems[key].gradient
     if options.world_sigma_m > 0.0:
         prior = 1.0 / options.world_sigma_m**2
         information[errors:, errors:] += prior * np.eye(width - errors)

@@ -29,7 +29,10 @@ CELL_RAD = np.radians(1.5)
 
 @dataclass(frozen=True, eq=False)
 class CornerEvidence:
-    """What the workflow knows beside the fit."""
+    """What the workflow knows beside the fit.
+
+    `rings_told` are the degrees of freedom that offsets of rings have taken from the residuals.
+    """
 
     positions: tuple[str, ...]
     left_out: tuple[LeftOut, ...]
@@ -39,6 +42,8 @@ class CornerEvidence:
     cloud_frame: CloudFrame
     frame_scatter_m: Mapping[str, FloatArray]
     turns: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    rings_told: float = 0.0
+    further_figures: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,7 @@ def judge_corner_fit(
 ) -> Quality:
     """Verdict on the joint estimate, with reasons and figures."""
     verdict = _Verdict()
-    factor = _common_error_factor(fit, places)
+    factor = common_error_factor(fit, places, evidence.rings_told)
     moves, statistic, known = place_discrepancies(fit)
     # Each place's corner by its own returns, at the common orientation: what the world coordinates are held against.
     corners = fit.state.scale * (fit.state.corners(fit.world) + np.where(known[:, None], moves[:, :3], 0.0))
@@ -84,6 +89,7 @@ def judge_corner_fit(
         "steps": fit.steps,
         "places_used": len(places),
         "faces_angles_deg": _face_angles_deg(fit.state.normals),
+        **evidence.further_figures,
     }
     if "log_scale" in fit.names:
         figures["scale_sigma"] = float(np.sqrt(fit.covariance[6, 6] * factor)) * fit.state.scale
@@ -295,14 +301,14 @@ def _judge_noise(verdict: _Verdict, fit: CornerFit, evidence: CornerEvidence) ->
         )
 
 
-def _common_error_factor(fit: CornerFit, places: Sequence[CornerPlaceFaces]) -> float:
+def common_error_factor(fit: CornerFit, places: Sequence[CornerPlaceFaces], rings_told: float = 0.0) -> float:
     """How much wider the covariance has to be because returns of one spot err together, frame after frame.
 
     The mean residual of each cell of 1.5 degrees should scatter as the range noise over its number of returns; faces
     that are not flat and beams with offsets of their own make it scatter more.
     """
     corners = fit.state.corners(fit.world)
-    total, cells, taken = 0.0, 0, 0.0
+    total, cells, taken = 0.0, 0, rings_told
     for i, place in enumerate(places):
         for j, returns in place.faces.items():
             residual = face_residuals(returns, fit.state.normals[j], corners[i])

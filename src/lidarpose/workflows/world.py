@@ -32,10 +32,12 @@ from lidarpose.refine.corner_model import (
 from lidarpose.refine.corner_verdict import (
     CornerEvidence,
     PrecisionLimits,
+    common_error_factor,
     cornerwise_covariance,
     judge_corner_fit,
     judge_corners,
 )
+from lidarpose.refine.ring_offsets import RingOffsets, find_rings, ring_offsets, rings_seem_off
 from lidarpose.solve.corner_alignment import cayley_pose, pair_scale, svd_pose
 from lidarpose.solve.corner_matching import face_order
 from lidarpose.workflows.corner_target import (
@@ -63,6 +65,8 @@ FIRST_RETURNS = 3000
 # That estimate's last step, in standard deviations.
 FIRST_SETTLED = 0.1
 SMALL_TURN_RAD = np.radians(3.0)
+# Offsets of rings, and how much else spots err together, are estimated in turn.
+RING_STEPS = 3
 # Twice the gain in log likelihood at which uncertain world coordinates are believed in.
 CONVINCING_GAIN = 9.0
 
@@ -252,6 +256,7 @@ def _joint(
     }
     places, frame_scatter, dropped = _without_odd_frames(observed, by_frame)
     fit, used = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too)
+    fit, used, offsets = _without_ring_offsets(mended, fit, used)
     left_out += [
         LeftOut(f"{name}: {n} frames", "their corner, or how much of the faces they show, is far from the others'")
         for name, n in dropped.items()
@@ -265,6 +270,8 @@ def _joint(
         session.cloud_frame,
         frame_scatter,
         _turns(session, fits, fit, used),
+        0.0 if offsets is None else offsets.told,
+        {} if offsets is None else offsets.figures,
     )
     quality = judge_corner_fit(fit, used, evidence, limits)
     calibration = WorldCalibration(
@@ -419,6 +426,27 @@ def _fit(
             options = CornerOptions(estimated, scale_too)
             fit = fit_corner_model(used, fit.state, fit.range_sigma_m, options, settled=settled)
     return fit, used
+
+
+def _without_ring_offsets(
+    session: CornerSession, fit: CornerFit, used: list[CornerPlaceFaces]
+) -> tuple[CornerFit, list[CornerPlaceFaces], RingOffsets | None]:
+    """The joint estimate beside offsets of a multi-beam LiDAR's rings, where the data speak for any."""
+    if session.cloud_frame != "lidar" or not rings_seem_off(fit, used):
+        return fit, used, None
+    rings = find_rings(used)
+    offsets = None if rings is None else ring_offsets(fit, used, rings)
+    clean, estimate = used, fit
+    for _ in range(RING_STEPS):
+        if rings is None or offsets is None:
+            return fit, used, None
+        clean = offsets.corrected(used)
+        estimate, _ = _fit(session, clean, estimate.state, estimate.range_sigma_m, "log_scale" in fit.names)
+        factor = common_error_factor(estimate, clean, offsets.told)
+        offsets = ring_offsets(estimate, clean, rings, offsets.offset_m, factor)
+    if offsets is None:
+        return fit, used, None
+    return replace(estimate, covariance=offsets.covariance), clean, offsets
 
 
 # ---- the paper's methods: a corner for each frame, a mean for each place, a closed form for the pose ----
