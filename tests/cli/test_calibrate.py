@@ -221,6 +221,15 @@ def test_an_offset_of_all_beam_angles_is_explained_not_estimated(
     assert "turn of the LiDAR about its own z axis" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "options",
+    [("--axis-beam-deg", "90"), ("--method", "harris"), ("--estimate", "beam-angle-offset"), ("--want-mm", "-1")],
+)
+def test_refused_options_leave_no_folder(simulated_session: Path, tmp_path: Path, options: tuple[str, ...]) -> None:
+    assert run(["calibrate", str(simulated_session), "-o", str(tmp_path / "a/b"), *options]) == 2
+    assert not (tmp_path / "a").exists()
+
+
 def test_readings_off_by_a_factor_are_mended_by_the_calibration_file(
     simulated_session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 
 import lidarpose
+from lidarpose.errors import InputError
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.camera import Camera
@@ -52,6 +53,7 @@ from lidarpose.storage.truth import truth_path
 RUNS = 40
 POINTS = 60_000
 LAST = 99_999
+PART = ".lidarpose-part-"
 CAMERA = Camera(64, 48, np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]))
 
 
@@ -316,8 +318,54 @@ def test_killed_at_any_moment(name: str, tmp_path: Path) -> None:
     # The next run that ends well leaves nothing of the killed ones.
     kind.write(out, LAST)
     kind.check(out)
+    if out.is_dir():
+        assert not [path for path in out.rglob("*") if PART in path.name]
     beside = {out, truth_path(out), Path(f"{out}.calibration.json")}
     assert [path.name for path in tmp_path.iterdir() if path not in beside] == []
+
+
+_PLACE_KILLED = """
+import os, signal, sys
+from pathlib import Path
+import numpy as np
+from lidarpose.model.cloud import Cloud
+from lidarpose.storage import cloud_import
+def killed(path, text):
+    if path.name == sys.argv[2]:
+        os.kill(os.getpid(), signal.SIGKILL)
+    write(path, text)
+write, cloud_import.write_text = cloud_import.write_text, killed
+cloud = Cloud(np.ones((3, 3), dtype=np.float32))
+cloud_import.add_place(Path(sys.argv[1]), [cloud], cloud_import.PlaceOptions(sys.argv[3] or None), Path("bag"))
+"""
+
+
+@pytest.mark.parametrize("before", ["session.toml", "positions.csv"])
+def test_a_place_killed_before_it_is_named_is_cleaned_by_the_next(tmp_path: Path, before: str) -> None:
+    """Between the clouds in their folder and the table that names them."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", _PLACE_KILLED, os.fspath(tmp_path), before, ""]
+    assert subprocess.run(command, env=environment).returncode == -signal.SIGKILL
+    assert [path.name for path in (tmp_path / "clouds").iterdir()] == ["p00"]
+    own = tmp_path / "clouds/mine"
+    own.mkdir()
+    said, _ = add_place(tmp_path, [cloud(1)], PlaceOptions(None, (1.0, 2.0, 3.0)), tmp_path)
+    assert said.startswith("place p00: 1 clouds")
+    (place,) = read_corner_session(tmp_path).places
+    assert len(place.clouds[0].load()) == POINTS
+    # What a user put there stays.
+    assert own.exists()
+    assert not [path for path in tmp_path.rglob("*") if PART in path.name]
+
+
+def test_a_place_that_cannot_be_named_is_not_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, _: str) -> None:
+        raise InputError(path, "cannot be written: No space left on device")
+
+    monkeypatch.setattr("lidarpose.storage.cloud_import.write_text", full)
+    with pytest.raises(InputError, match="No space left"):
+        add_place(tmp_path, [cloud(1)], PlaceOptions("p00"), tmp_path)
+    assert not (tmp_path / "clouds/p00").exists()
 
 
 def main(kind: Kind, out: Path) -> None:

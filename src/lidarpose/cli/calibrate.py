@@ -92,11 +92,11 @@ def calibrate(
     report
         Write report.html too.
     """
-    from lidarpose.storage.atomic import prepare_folder
+    from lidarpose.storage.atomic import require_writable_folder
     from lidarpose.storage.recording import is_recording
     from lidarpose.storage.session import CORNER_SESSION_FORMAT, SESSION_FORMAT, session_format
 
-    prepare_folder(output)
+    require_writable_folder(output)
     if is_recording(session):
         _calibrate_recording(
             session,

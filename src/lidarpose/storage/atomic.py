@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lidarpose.errors import InputError
@@ -19,9 +19,10 @@ _MARK = ".lidarpose-part-"
 def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Give a temporary path in the same folder; on success it takes the place of `path`, else it is removed.
 
-    The temporary name keeps the suffix, for writers that choose a format by it. The file is flushed to the disk
-    before the rename, so that a power cut leaves either the old file or the new one; not so with `durable` False,
-    for large files that can be made again (a killed process leaves the old or the new one all the same).
+    Folders that were made for it go again, too. The temporary name keeps the suffix, for writers that choose a format
+    by it. The file is flushed to the disk before the rename, so that a power cut leaves either the old file or the new
+    one; not so with `durable` False, for large files that can be made again (a killed process leaves the old or the
+    new one all the same).
 
     Raises
     ------
@@ -30,18 +31,18 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """
     path = Path(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _clean_left_overs(path)
-        if path.is_dir():
-            raise InputError(path, "is a folder", expected="the name of a file to write")
-        temporary = path.with_name(f"{path.stem}{_MARK}{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
-        try:
-            yield temporary
-            if durable:
-                _flush_to_disk(temporary)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with _folder_made_for(path):
+            _clean_left_overs(path)
+            if path.is_dir():
+                raise InputError(path, "is a folder", expected="the name of a file to write")
+            temporary = path.with_name(f"{path.stem}{_MARK}{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+            try:
+                yield temporary
+                if durable:
+                    _flush_to_disk(temporary)
+                temporary.replace(path)
+            finally:
+                temporary.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(path, f"cannot be written: {error.strerror or error}") from error
 
@@ -61,21 +62,35 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     mark = f"{_MARK}{os.getpid()}-{secrets.token_hex(4)}"
     temporary, old = path.with_name(path.name + mark), path.with_name(path.name + mark + "-old")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        restore_folder(path)
-        temporary.mkdir()
-        try:
-            yield temporary
-            if path.exists():
-                path.rename(old)
-            temporary.rename(path)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-            if old.exists() and not path.exists():
-                old.rename(path)
-            shutil.rmtree(old, ignore_errors=True)
+        with _folder_made_for(path):
+            restore_folder(path)
+            temporary.mkdir()
+            try:
+                yield temporary
+                if path.exists():
+                    path.rename(old)
+                temporary.rename(path)
+            finally:
+                shutil.rmtree(temporary, ignore_errors=True)
+                if old.exists() and not path.exists():
+                    old.rename(path)
+                shutil.rmtree(old, ignore_errors=True)
     except OSError as error:
         raise InputError(path, f"cannot be written: {error.strerror or error}") from error
+
+
+@contextmanager
+def _folder_made_for(path: Path) -> Iterator[None]:
+    """Make the folder that `path` lies in; where the work fails, those that were made go again if they are empty."""
+    missing = [folder for folder in path.absolute().parents if not folder.exists()]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for folder in missing:
+                folder.rmdir()
+        raise
 
 
 def require_new_folder(path: Path) -> None:
@@ -91,16 +106,48 @@ def require_new_folder(path: Path) -> None:
         )
 
 
-def prepare_folder(path: Path) -> None:
-    """Make a folder for results, before work is done that could not be saved. Raises InputError if it cannot be."""
-    try:
-        Path(path).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            path, f"cannot be made: {error.strerror or error}", expected="a folder for the results"
-        ) from error
-    if not os.access(path, os.W_OK):
-        raise InputError(path, "cannot be written to", expected="a folder for the results")
+def require_writable_folder(path: Path) -> None:
+    """InputError if a folder for results is not there and could not be made, before work is done for it.
+
+    Nothing is made yet: work that is refused or killed leaves no empty folder.
+    """
+    path = Path(path)
+    for at in (path, *path.absolute().parents):
+        try:
+            at.lstat()
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise InputError(
+                path, f"cannot be made: {error.strerror or error}", expected="a folder for the results"
+            ) from error
+        if not at.is_dir():
+            raise InputError(path, f"cannot be made: {at} is no folder", expected="a folder for the results")
+        if not os.access(at, os.W_OK | os.X_OK):
+            what = "cannot be written to" if at == path else f"cannot be made: {at} cannot be written to"
+            raise InputError(path, what, expected="a folder for the results")
+        return
+
+
+def mark_unfinished(folder: Path) -> Path:
+    """Put a mark into a folder that is whole but not yet named where readers look; to be removed when it is."""
+    mark = folder / f"{_MARK}{os.getpid()}"
+    mark.touch()
+    return mark
+
+
+def clean_unfinished(parent: Path, named: Collection[str]) -> None:
+    """Remove what killed runs left in a folder of folders: temporary ones, and marked ones that are not `named`."""
+    for left in [*parent.glob("*")] if parent.is_dir() else ():
+        if _MARK in left.name:
+            restore_folder(parent / left.name.split(_MARK, 1)[0])
+            continue
+        for mark in left.glob(f"{_MARK}*"):
+            process = mark.name.removeprefix(_MARK)
+            if process.isdigit() and not _is_alive(int(process)):
+                if left.name not in named:
+                    shutil.rmtree(left, ignore_errors=True)
+                mark.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
