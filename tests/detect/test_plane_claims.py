@@ -1,13 +1,25 @@
 """Planes of the whole cloud from a rough idea of them: against plain least squares, and along seams."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
 from lidarpose.detect.plane_claims import Slab, patches_of_slabs
+from lidarpose.geometry import compiled
 from lidarpose.geometry.arrays import FloatArray, angle_between
 from lidarpose.geometry.planes import Plane, fit_plane
 
 SIGMA_M = 0.005
+
+
+@pytest.fixture(autouse=True, params=["numpy", "compiled"])
+def way(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Everything here both ways."""
+    if request.param == "compiled" and not compiled.installed():
+        pytest.skip("numba is not installed")
+    with compiled.forced(request.param == "compiled"):
+        yield
 
 
 def face(n: int, rng: np.random.Generator) -> FloatArray:

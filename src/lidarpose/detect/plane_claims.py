@@ -12,12 +12,15 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarpose.detect.plane_raster import PlaneRaster, grown, raster_of, spacing_m
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
+from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.planes import Plane
 from lidarpose.geometry.robust import mad_sigma
 from lidarpose.model.plane_patch import PlanePatch
@@ -29,6 +32,8 @@ Float32Array = NDArray[np.float32]
 # would not be, as products with a vector have another limit.
 BLOCK = 32_000
 SLABS_AT_ONCE = 2
+# By how much kernels are done sooner, on two cores.
+SAVED_S_PER_POINT_AND_SLAB = 3e-9
 GATE_SIGMAS = 3.0
 # Claimed is more than is kept in the end: what lies around a slab tells whether it is a surface.
 CLAIM_SIGMAS = 6.0
@@ -47,6 +52,8 @@ FEW_POINTS = 50_000
 MOST_STEPS = 6
 FEWEST = 6
 SPREAD_POINTS = 10_000
+# They are read in runs, as neighbours in memory cost hardly more than one alone.
+RUN = 16
 # Of the terms 1, height, u, v.
 _ON_PLANE = [0, 2, 3]
 
@@ -108,30 +115,126 @@ class Slab:
         numbers += v.astype(np.int32)
         return numbers
 
+    def turned(self, lean: FloatArray) -> FloatArray:
+        """What takes (x, y, z, 1) to heights over the plane that has the heights lean . (1, u, v) over this one."""
+        return np.asarray(self.rows[1] - lean @ self.rows[[0, 2, 3]])
+
     def leant(self, lean: FloatArray) -> Plane:
-        """The plane that has the heights lean . (1, u, v) over this one."""
-        turned = self.rows[1] - lean @ self.rows[[0, 2, 3]]
+        """That plane."""
+        turned = self.turned(lean)
         plane = Plane(turned[:3], -float(turned[3]))
         return plane if plane.offset <= 0.0 else plane.flipped()
 
 
+class _Claims(Protocol):
+    """Points of a block near one patch, at least those in its cells."""
+
+    @property
+    def indices(self) -> IntArray:
+        """Which of the cloud's (M,)."""
+        ...
+
+    @property
+    def terms(self) -> Float32Array:
+        """1, height, u and v (4, M)."""
+        ...
+
+    @property
+    def held(self) -> BoolArray:
+        """Which lie in the patch's cells (M,)."""
+        ...
+
+    @property
+    def disputed(self) -> NDArray[np.integer]:
+        """The positions among them of those that another patch claims too."""
+        ...
+
+    def held_count(self) -> int: ...
+
+    def some(self, every: int, run: int) -> tuple[IntArray, Float32Array]:
+        """Those in the patch's cells that are in every so manieth run of the cloud's points, and their terms."""
+        ...
+
+    def only(self, keep: BoolArray) -> _Claims:
+        """These points without those that are not to be kept."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
-class _Claims:
-    """Points of a block near one patch: which (M,), their terms (1, height, u, v) (4, M), which lie in the patch's
-    cells, and the positions among them of those that another patch claims too."""
+class _Terms:
+    """Claims as NumPy makes them: with all that is known of each point."""
 
     indices: IntArray
     terms: Float32Array
     held: BoolArray
     disputed: IntArray
 
-    def moments(self, rest: Float32Array, sigma_m: float) -> Float32Array:
-        """Sums (4, 4) of the terms' products within the gate and outside of seams, by the points' heights (M,)."""
-        apart = np.abs(rest)
-        apart[self.disputed] = np.inf
-        inside = apart < np.float32(GATE_SIGMAS * sigma_m)
-        inside &= self.held
-        return np.asarray((self.terms * inside.astype(np.float32)) @ self.terms.T)
+    def held_count(self) -> int:
+        return int(np.count_nonzero(self.held))
+
+    def some(self, every: int, run: int) -> tuple[IntArray, Float32Array]:
+        few = np.flatnonzero(self.held & _runs(every, run)[self.indices % BLOCK])
+        return self.indices[few], self.terms.take(few, axis=1)
+
+    def only(self, keep: BoolArray) -> _Terms:
+        return replace(self, held=self.held & keep)
+
+
+@dataclass(frozen=True, eq=False)
+class _Positions:
+    """Claims as kernels make them: positions `index` (M,) in a block with the points `columns` (3, N) from number
+    `first` on; what else is known of them is worked out if it is asked for."""
+
+    slab: Slab
+    columns: Float32Array
+    first: int
+    index: NDArray[np.uint32]
+    disputed: NDArray[np.integer]
+
+    @property
+    def indices(self) -> IntArray:
+        return self.index + np.int64(self.first)
+
+    @cached_property
+    def terms(self) -> Float32Array:
+        return self._terms_of(self.index)
+
+    @property
+    def held(self) -> BoolArray:
+        return np.ones(len(self.index), dtype=bool)
+
+    def held_count(self) -> int:
+        return len(self.index)
+
+    def some(self, every: int, run: int) -> tuple[IntArray, Float32Array]:
+        few = self.index[_runs(every, run)[self.index]]
+        return few + np.int64(self.first), self._terms_of(few)
+
+    def only(self, keep: BoolArray) -> _Positions:
+        disputed = np.zeros(len(keep), dtype=bool)
+        disputed[self.disputed] = True
+        return replace(self, index=self.index[keep], disputed=np.flatnonzero(disputed[keep]))
+
+    def _terms_of(self, index: NDArray[np.uint32]) -> Float32Array:
+        rows = self.slab.rows[:4].astype(np.float32)
+        terms = rows[:, :3] @ self.columns.take(index, axis=1)
+        terms += rows[:, 3:]
+        return terms
+
+
+@lru_cache(maxsize=64)
+def _runs(every: int, run: int) -> BoolArray:
+    """Which positions in a block lie in every so manieth run of neighbours; odd steps hit each ring of a LiDAR."""
+    return np.asarray(np.arange(BLOCK) // run % (every | 1) == 0)
+
+
+def _moments(claims: _Claims, rest: Float32Array, sigma_m: float) -> Float32Array:
+    """Sums (4, 4) of the terms' products within the gate and outside of seams, by the points' heights (M,)."""
+    apart = np.abs(rest)
+    apart[claims.disputed] = np.inf
+    inside = apart < np.float32(GATE_SIGMAS * sigma_m)
+    inside &= claims.held
+    return np.asarray((claims.terms * inside.astype(np.float32)) @ claims.terms.T)
 
 
 _Part = tuple[_Claims, Float32Array]
@@ -182,21 +285,25 @@ def patches_of_slabs(
     -------
     For each slab its patch; None where too few points are there. No point belongs to two.
     """
+    compiled = pays(SAVED_S_PER_POINT_AND_SLAB * len(x) * len(slabs))
     blocks = [slice(first, min(first + BLOCK, len(x))) for first in range(0, len(x), BLOCK)]
     workers = min(os.cpu_count() or 1, len(blocks))
+    claim, members_in = (_claim_compiled, _members_compiled) if compiled else (_claim, _members)
     with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(lambda block: _claim(x, free, slabs, block), blocks))
+        parts = list(pool.map(lambda block: claim(x, free, slabs, block), blocks))
         of_slabs = list(pool.map(_screened, slabs, ([part[k] for part in parts] for k in range(len(slabs)))))
         fits = list(pool.map(lambda slab, mine: _fit(slab, mine, widest_m), slabs, of_slabs))
-        members = list(pool.map(lambda block, part: _members(block, part, fits), blocks, zip(*of_slabs, strict=True)))
+        of_blocks = zip(*of_slabs, strict=True)
+        members = list(pool.map(lambda block, part: members_in(block, part, fits), blocks, of_blocks))
+        indices = list(pool.map(np.concatenate, zip(*members, strict=True)))
     patches: list[Claim | None] = []
     for k, fit in enumerate(fits):
         if fit is None:
             patches.append(None)
             continue
-        patch = PlanePatch(slabs[k].leant(fit.lean), np.concatenate([m[k] for m in members]), fit.sigma_m)
-        every = sum(len(claims.indices) for claims, _ in of_slabs[k]) // EVIDENCE_POINTS + 1
-        around = [claims.indices[::every][claims.held[::every]] for claims, _ in of_slabs[k]]
+        patch = PlanePatch(slabs[k].leant(fit.lean), indices[k], fit.sigma_m)
+        held = sum(claims.held_count() for claims, _ in of_slabs[k])
+        around = [claims.some(held // EVIDENCE_POINTS + 1, 1)[0] for claims, _ in of_slabs[k]]
         patches.append(Claim(patch, fit.variances, np.concatenate(around)))
     return patches
 
@@ -232,11 +339,33 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
         doubtful = doubtful[held[doubtful]]
         times[indices[doubtful]] += 1
         found.append((indices, terms, held, doubtful))
-    parts = []
+    parts: list[_Part] = []
     for slab, (indices, terms, held, doubtful) in zip(slabs, found, strict=True):
-        claims = _Claims(indices + block.start, terms, held, doubtful[times[indices[doubtful]] > 1])
-        parts.append((claims, claims.moments(terms[1], slab.sigma_m)))
+        claims = _Terms(indices + block.start, terms, held, doubtful[times[indices[doubtful]] > 1])
+        parts.append((claims, _moments(claims, terms[1], slab.sigma_m)))
     return parts
+
+
+def _claim_compiled(
+    x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab], block: slice
+) -> list[_Part]:
+    """`_claim` by kernels, which drop what is not held."""
+    from lidarpose.detect.plane_kernels import claims_of_block, columns_of
+
+    gates = np.array([[CLAIM_SIGMAS * s.sigma_m, GATE_SIGMAS * s.sigma_m] for s in slabs])
+    rows = np.stack([s.rows[1:] for s in slabs])
+    rows[:, 0] /= gates[:, :1]
+    allowed = np.concatenate([s.allowed for s in slabs]).view(np.uint8)
+    starts = np.cumsum([0] + [len(s.allowed) for s in slabs])
+    widths = np.array([s.raster.shape[1] for s in slabs])
+    of_block = np.zeros(0, dtype=bool) if free is None else free[block]
+    columns = columns_of(np.ascontiguousarray(x[block]))
+    held, ends, disputed, disputed_ends, moments = claims_of_block(
+        columns, of_block, rows.astype(np.float32), allowed, starts, widths, gates
+    )
+    mine = np.split(held, ends[:-1])
+    theirs = np.split(disputed, disputed_ends[:-1])
+    return [(_Positions(slab, columns, block.start, mine[k], theirs[k]), moments[k]) for k, slab in enumerate(slabs)]
 
 
 def _screened(slab: Slab, parts: Sequence[_Part]) -> Sequence[_Part]:
@@ -251,14 +380,14 @@ def _screened(slab: Slab, parts: Sequence[_Part]) -> Sequence[_Part]:
         inside += np.bincount(cell[claims.held & near], minlength=len(inside))
         around += np.bincount(cell[claims.held & ~near], minlength=len(inside))
     solid = inside > STANDS_OUT * (inside + around)
-    kept = [replace(claims, held=claims.held & solid[cell]) for (claims, _), cell in zip(parts, cells, strict=True)]
-    return [(claims, claims.moments(claims.terms[1], slab.sigma_m)) for claims in kept]
+    kept = [claims.only(solid[cell]) for (claims, _), cell in zip(parts, cells, strict=True)]
+    return [(claims, _moments(claims, claims.terms[1], slab.sigma_m)) for claims in kept]
 
 
 def _cluttered(parts: Sequence[_Part]) -> bool:
     """Whether many claims lie outside the gate."""
     within = sum(float(moments[0, 0]) for _, moments in parts)
-    held = sum(np.count_nonzero(claims.held) - len(claims.disputed) for claims, _ in parts)
+    held = sum(claims.held_count() - len(claims.disputed) for claims, _ in parts)
     return held - within >= CLUTTERED * held
 
 
@@ -286,9 +415,9 @@ def _fit(slab: Slab, parts: Sequence[_Part], widest_m: float) -> _Fit | None:
         limit = SMALL_STEP if count < FEW_POINTS else near_enough
         if step @ plain @ step < (limit * slab.sigma_m) ** 2:
             break
-        sums = [claim.moments(_rest(claim.terms, lean), slab.sigma_m) for claim in claims]
+        sums = [_moments(claim, _rest(claim.terms, lean), slab.sigma_m) for claim in claims]
     every = int(count) // SPREAD_POINTS + 1
-    rest = np.concatenate([_rest(claim.terms[:, ::every], lean)[claim.held[::every]] for claim in claims])
+    rest = _rest(np.concatenate([claim.some(every, RUN)[1] for claim in claims], axis=1), lean)
     rest = rest[np.abs(rest) < GATE_SIGMAS * slab.sigma_m]
     sigma_m = min(max(mad_sigma(rest, centred=True), 0.5 * slab.sigma_m), widest_m)
     return _Fit(lean, sigma_m, variances)
@@ -318,4 +447,19 @@ def _members(block: slice, parts: Sequence[_Part], fits: Sequence[_Fit | None]) 
         mine[disputed] = ~taken[places]
         taken[places] = True
         members.append(claims.indices[mine])
+    return members
+
+
+def _members_compiled(block: slice, parts: Sequence[_Part], fits: Sequence[_Fit | None]) -> list[IntArray]:
+    """`_members` by kernels."""
+    from lidarpose.detect.plane_kernels import members_of
+
+    taken = np.zeros(block.stop - block.start, dtype=bool)
+    members = []
+    for (claims, _), fit in zip(parts, fits, strict=True):
+        if fit is None or not isinstance(claims, _Positions):
+            members.append(np.zeros(0, dtype=np.int64))
+            continue
+        row = (claims.slab.turned(fit.lean) / (GATE_SIGMAS * fit.sigma_m)).astype(np.float32)
+        members.append(members_of(claims.columns, claims.index, claims.disputed, row, claims.first, taken))
     return members

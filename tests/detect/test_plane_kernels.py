@@ -1,0 +1,76 @@
+"""The compiled passes over a cloud against NumPy's: the same patches, but for points within rounding of a gate."""
+
+import numpy as np
+import pytest
+from benchmarks.suites.plane_search import scene
+
+from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
+from lidarpose.geometry import compiled
+from lidarpose.geometry.arrays import FloatArray, angle_between
+from lidarpose.model.plane_patch import PlanePatch
+
+pytestmark = pytest.mark.skipif(not compiled.installed(), reason="numba is not installed")
+
+# Of the patches' points, which differ; and of their planes, beside 1e-5 rad and 20 um that 100 000 points leave.
+MOST_OTHERS = 1e-4
+SAME_NORMAL_RAD, SAME_OFFSET_M = 1e-6, 2e-6
+
+
+def both_ways(points: FloatArray, search: PlaneSearch) -> list[tuple[PlanePatch, ...]]:
+    patches = []
+    for way in (False, True):
+        with compiled.forced(way):
+            patches.append(segment_planes(points, search))
+    return patches
+
+
+def assert_the_same(ways: list[tuple[PlanePatch, ...]]) -> None:
+    plain, quick = ways
+    assert len(plain) == len(quick) > 0
+    for a, b in zip(plain, quick, strict=True):
+        assert len(np.setxor1d(a.indices, b.indices)) <= MOST_OTHERS * len(a)
+        assert angle_between(a.plane.normal, b.plane.normal) < SAME_NORMAL_RAD
+        assert a.plane.offset == pytest.approx(b.plane.offset, abs=SAME_OFFSET_M)
+        assert a.sigma_m == pytest.approx(b.sigma_m, rel=1e-4)
+        assert np.all(np.diff(b.indices) > 0)
+    assert_apart(quick)
+
+
+def assert_apart(patches: tuple[PlanePatch, ...]) -> None:
+    every = np.concatenate([patch.indices for patch in patches])
+    assert len(np.unique(every)) == len(every)
+
+
+@pytest.mark.parametrize("small", [None, 0.02])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_patches_are_the_same(small: float | None, dtype: type) -> None:
+    points, _ = scene(240_000, small, 1)
+    assert_the_same(both_ways(points.astype(dtype), PlaneSearch(max_planes=3)))
+
+
+def test_further_rounds_over_what_is_left_find_the_same() -> None:
+    """A cloud of many patches, some of them found among the points that the first ones left: a point more or less in
+    those, and another subsample is drawn, from which the others start."""
+    rng = np.random.default_rng(2)
+    faces = []
+    for k, count in enumerate([200_000, 150_000, 100_000, 40_000, 9_000, 4_000]):
+        flat = np.column_stack([rng.uniform(-1.0, 1.0, (count, 2)), rng.normal(0.0, 0.004, count)])
+        faces.append(np.roll(flat, k, axis=1) + [3.0 + 1.3 * k, 2.0 - k, 0.7 * k])
+    points = np.concatenate([*faces, rng.uniform(-4.0, 12.0, (300_000, 3))])
+    plain, quick = both_ways(points[rng.permutation(len(points))], PlaneSearch(min_points=1000))
+    assert len(plain) == len(quick) >= 5
+    for a, b in zip(plain, quick, strict=True):
+        # Three standard deviations of what so many points tell.
+        limit = 3.0 * a.sigma_m / np.sqrt(len(a))
+        assert angle_between(a.plane.normal, b.plane.normal) < limit / 0.58
+        assert a.plane.offset == pytest.approx(b.plane.offset, abs=7.0 * limit)
+        assert len(np.setxor1d(a.indices, b.indices)) <= 0.01 * len(a)
+    assert_apart(quick)
+
+
+def test_points_in_another_order_of_memory() -> None:
+    """Columns of a wider array, as a cloud with intensities has them."""
+    points, _ = scene(240_000, None, 2)
+    wide = np.zeros((len(points), 5), dtype=np.float32)
+    wide[:, 1:4] = points
+    assert_the_same(both_ways(wide[:, 1:4], PlaneSearch(max_planes=3)))
