@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -143,7 +144,7 @@ def calibrate(
         "want_mm": want_mm,
         "want_deg": want_deg,
     }
-    run = _calibrate_turntable(session, options, quiet=quiet or json)
+    run = _calibrate_turntable(session, options, with_report=report, quiet=quiet or json)
     _finish(run, session, output, with_report=report, json=json, quiet=quiet)
 
 
@@ -213,15 +214,20 @@ def _refuse_if_rejected(quality: Quality | None) -> None:
         raise RejectedError("The calibration is rejected", reasons=quality.reasons)
 
 
-def _calibrate_turntable(folder: Path, options: dict[str, Any], *, quiet: bool) -> TurntableRun:
+def _calibrate_turntable(folder: Path, options: dict[str, Any], *, with_report: bool, quiet: bool) -> TurntableRun:
     from lidarpose.cli.console import progress
-    from lidarpose.refine.turntable import JointOptions
+    from lidarpose.refine.joint_options import JointOptions
     from lidarpose.storage.provenance import provenance
     from lidarpose.storage.session import read_turntable_session, session_files
     from lidarpose.workflows.turntable import calibrate_turntable
 
     session = read_turntable_session(folder, any_order=options["any_order"])
     first_panel = options["first_panel"]
+
+    def record() -> dict[str, Any]:
+        _import_what_follows(with_report=with_report)
+        return provenance("calibrate", folder, session_files(folder, session), options)
+
     wishes = {k: options[k] for k in ("want_mm", "want_deg") if options[k] is not None}
     with progress("images and scans", len(session.places), quiet=quiet) as advance:
         return calibrate_turntable(
@@ -230,9 +236,16 @@ def _calibrate_turntable(folder: Path, options: dict[str, Any], *, quiet: bool) 
             first_panel=None if first_panel is None else first_panel - 1,
             options=JointOptions(estimate=tuple(_parameter_name(extra) for extra in options["estimate"]), **wishes),
             stated=StatedSense(options["beams_turn"], options["table_turns"]),
-            provenance=provenance("calibrate", folder, session_files(folder, session), options),
+            provenance=record,
             step=advance,
         )
+
+
+def _import_what_follows(*, with_report: bool) -> None:
+    """Modules that are needed when the calibration is there, while other processes are still searching images."""
+    report = ("lidarpose.report.turntable_page",) if with_report else ()
+    for name in ("lidarpose.cli.turntable_summary", "rich.console", "rich.table", *report):
+        import_module(name)
 
 
 def _parameter_name(extra: str) -> str:

@@ -19,9 +19,10 @@ from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.turntable import PARAMETER_NAMES
 from lidarpose.model.turntable_result import ExtraParameter
 from lidarpose.refine.contradictions import Explanation
+from lidarpose.refine.joint_options import JointOptions
 from lidarpose.refine.observability import PoseSpread
 from lidarpose.refine.turntable_estimate import OutsideParameters, move_of_extra
-from lidarpose.refine.turntable_joint import JointOptions, Solution
+from lidarpose.refine.turntable_joint import Solution
 
 EXTRA_WORDS: dict[str, str] = {
     "encoder_scale": "the turntable's readings seem to be off by a factor",

@@ -15,6 +15,7 @@ from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_result import ExtraParameter, TurntableEstimate
 from lidarpose.refine.alternatives import duplicates, explain_by_alternative
 from lidarpose.refine.contradictions import explanations
+from lidarpose.refine.joint_options import JointOptions
 from lidarpose.refine.named_effect import paid_for, shift_of, strongest_effects, suggested
 from lidarpose.refine.observability import pose_spread, weak_directions, whole_turn
 from lidarpose.refine.stability import leave_places_out
@@ -29,7 +30,7 @@ from lidarpose.refine.turntable_estimate import (
     residual_groups,
     tested_extras,
 )
-from lidarpose.refine.turntable_joint import JointOptions, Solution, solve_joint
+from lidarpose.refine.turntable_joint import Solution, solve_joint
 from lidarpose.refine.turntable_layout import lay_out
 from lidarpose.refine.turntable_parameters import EXTRAS
 from lidarpose.refine.turntable_state import start_state

@@ -8,7 +8,7 @@ way: one factor on the stated standard deviations a kind, and the variance of wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,11 +16,9 @@ import numpy as np
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.robust import huber_weights, mad_sigma
-from lidarpose.geometry.se3 import Pose
-from lidarpose.model.observation import TurntableObservations
-from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_result import Kind
 from lidarpose.refine.drift import Drift, drift, smooth_factor
+from lidarpose.refine.joint_options import JointOptions
 from lidarpose.refine.least_squares import (
     SQRT3,
     LineEffects,
@@ -45,45 +43,6 @@ from lidarpose.refine.turntable_state import JointState
 
 Moments = dict[Kind, FloatArray]
 """By kind: `line_moments` (S, b + 3, b + 3)."""
-
-Start = tuple[TurntableMotion, Mapping[str, tuple[Pose | None, ...]]]
-
-
-@dataclass(frozen=True)
-class JointOptions:
-    """What to estimate beside the 22 numbers, and what the user wants.
-
-    Attributes
-    ----------
-    estimate
-        Extra parameters, names of `lidarpose.refine.turntable_parameters.EXTRAS`.
-    use_stripes
-        False: work from boards and scans alone.
-    want_mm, want_deg
-        The standard deviation of position and orientation, inside the recorded arc, that still counts as good.
-    max_iterations
-        Of the solver.
-    restart
-        Makes a start from observations; lets the search for contradictions try alternatives (a scan reversed, panels
-        swapped) from a start of their own. The workflow gives the closed form.
-    search_alternatives
-        Whether to look for an explanation when the residuals are bad.
-    """
-
-    estimate: tuple[str, ...] = ()
-    use_stripes: bool = True
-    want_mm: float = 2.0
-    want_deg: float = 0.2
-    max_iterations: int = 60
-    restart: Callable[[TurntableObservations], Start] | None = None
-    search_alternatives: bool = True
-
-    def __post_init__(self) -> None:
-        unknown = [name for name in self.estimate if name not in EXTRAS]
-        if unknown:
-            raise ValueError(f"unknown parameter {unknown[0]!r}; known are {', '.join(EXTRAS)}")
-        if not (self.want_mm > 0.0 and self.want_deg > 0.0):
-            raise ValueError("the wanted standard deviations must be positive")
 
 
 @dataclass(frozen=True, eq=False)

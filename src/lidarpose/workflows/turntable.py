@@ -7,7 +7,8 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import chain, groupby, pairwise
+from importlib import import_module
+from itertools import chain, groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,8 +32,7 @@ if TYPE_CHECKING:
     from lidarpose.detect.chessboard import BoardDetection
     from lidarpose.detect.laser_stripe import StripeFinder
     from lidarpose.model.turntable_result import TurntableEstimate
-    from lidarpose.refine.turntable import JointOptions
-    from lidarpose.refine.turntable_joint import Start
+    from lidarpose.refine.joint_options import JointOptions, Start
     from lidarpose.solve.light_plane import StripePair
     from lidarpose.solve.panel_pose import PanelPose
     from lidarpose.solve.paper import PaperSolution
@@ -54,7 +54,10 @@ BATCHES_AHEAD = 4
 """So many batches of images are decoded while earlier ones are searched; more would only take memory."""
 
 LEAST_BATCHES = 3
-"""With fewer there is too little to share; with more their number is a multiple of four, for two or four processes."""
+"""With fewer there is too little to share."""
+
+LEAST_AT_ONCE = 3
+"""The last batches are smaller, down to this, so that no process waits long for another one's last batch."""
 
 MOST_CONTRADICTING = 0.15
 """Share of the places with both stripes that may contradict the others before the whole is in doubt."""
@@ -97,7 +100,7 @@ def calibrate_turntable(
     first_panel: int | None = None,
     options: JointOptions | None = None,
     stated: StatedSense | None = None,
-    provenance: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Any] | Callable[[], Mapping[str, Any]] | None = None,
     step: Step | None = None,
 ) -> TurntableRun:
     """Find the LiDAR's pose in the camera frame as a function of the turntable's reading.
@@ -114,6 +117,8 @@ def calibrate_turntable(
         Of the joint estimate.
     stated
         How beams and table turn, as the user sees it on his rig; a result that contradicts it is rejected.
+    provenance
+        For the calibration; what makes it, if it takes time, is called while the images are searched.
     step
         Called after each place.
 
@@ -124,7 +129,13 @@ def calibrate_turntable(
     UndeterminedError
         If the session does not determine the motion; the message says why, and what to record.
     """
-    features = detect_features(session, step=step)
+    recorded: list[Mapping[str, Any]] = []
+
+    def meanwhile() -> None:
+        recorded.append(provenance() if callable(provenance) else provenance or {})
+        _import_what_follows()
+
+    features = detect_features(session, step=step, meanwhile=meanwhile)
     try:
         observations, fitted = assign_lines(session, features, first_panel=first_panel)
     except UndeterminedError as error:
@@ -140,10 +151,10 @@ def calibrate_turntable(
         samples = {position: sample.pose for position, sample in paper.samples.items()}
     if method == "joint":
         estimate = refine(observations, start, options)
-        calibration = estimate.calibration(provenance)
+        calibration = estimate.calibration(recorded[0])
         left_out = estimate.left_out
     else:
-        calibration = TurntableCalibration(paper.motion, quality=paper_quality(paper), provenance=provenance or {})
+        calibration = TurntableCalibration(paper.motion, quality=paper_quality(paper), provenance=recorded[0])
         left_out = paper.left_out
     calibration = replace(
         calibration,
@@ -232,20 +243,29 @@ def doubted(quality: Quality | None, features: DetectedFeatures, observations: T
     return replace(quality, verdict="doubtful", reasons=(*quality.reasons, reason))
 
 
-def detect_features(session: TurntableSession, *, step: Step | None = None) -> DetectedFeatures:
+def _import_what_follows() -> None:
+    """Modules that the job needs once its images are searched."""
+    for name in ("solve.assignment", "solve.paper", "refine.turntable"):
+        import_module(f"lidarpose.{name}")
+
+
+def detect_features(
+    session: TurntableSession, *, step: Step | None = None, meanwhile: Callable[[], object] = lambda: None
+) -> DetectedFeatures:
     """Boards, stripes and scan lines of a session (sections 1.2 to 1.4), on all cores.
 
     Where this process may be forked, copies of it take their share of the places; the result is the same without.
+    `meanwhile` is called once, while others search or decode images.
     """
     batches = _batches(session.places)
     copies = copies_allowed() if len(batches) >= LEAST_BATCHES else 0
     if copies == 0:
-        found = _detect_alone(session, batches, step)
+        found = _detect_alone(session, batches, step, meanwhile)
     else:
         from lidarpose.detect.opencv_threads import one_opencv_thread
 
         with one_opencv_thread():
-            found = _detect_with_copies(session, batches, copies, step)
+            found = _detect_with_copies(session, batches, copies, step, meanwhile)
     boards, all_lines, all_stripes = found
     places: list[PlaceFeatures] = []
     left_out: list[LeftOut] = []
@@ -259,7 +279,9 @@ def detect_features(session: TurntableSession, *, step: Step | None = None) -> D
     return DetectedFeatures(boards, tuple(places), tuple(left_out), notes)
 
 
-def _detect_alone(session: TurntableSession, batches: Sequence[Batch], step: Step | None) -> _Detected:
+def _detect_alone(
+    session: TurntableSession, batches: Sequence[Batch], step: Step | None, meanwhile: Callable[[], object]
+) -> _Detected:
     """Boards, scan lines and stripes by this process alone.
 
     Images are decoded ahead by threads of their own: decoding is most of the work, and leaves the interpreter free for
@@ -269,6 +291,7 @@ def _detect_alone(session: TurntableSession, batches: Sequence[Batch], step: Ste
     try:
         decoded = _decoded_ahead(executor, batches)
         boards, finders = _detect_boards(session)
+        meanwhile()
         lines = [_find_scan_lines(session, place) for batch in batches for place in batch]
         stripes: list[_Stripes] = []
         for batch in batches:
@@ -281,7 +304,11 @@ def _detect_alone(session: TurntableSession, batches: Sequence[Batch], step: Ste
 
 
 def _detect_with_copies(
-    session: TurntableSession, batches: Sequence[Batch], copies: int, step: Step | None
+    session: TurntableSession,
+    batches: Sequence[Batch],
+    copies: int,
+    step: Step | None,
+    meanwhile: Callable[[], object],
 ) -> _Detected:
     """The same with the help of forked copies: scans while the boards are found, then images."""
     found: list[tuple[Mapping[str, BoardDetection], Mapping[str, StripeFinder]]] = []
@@ -297,7 +324,7 @@ def _detect_with_copies(
         images = [None if place.stripe_image is None else place.stripe_image.load() for place in batches[k]]
         return _find_stripes(finders[batches[k][0].placement], batches[k], images)
 
-    stripes = share(search, len(batches), copies=copies, done=lambda k: _advance(step, batches[k]))
+    stripes = share(search, len(batches), copies=copies, first=meanwhile, done=lambda k: _advance(step, batches[k]))
     return boards, list(chain(*lines)), list(chain(*stripes))
 
 
@@ -359,15 +386,14 @@ def _find_scan_lines(session: TurntableSession, place: TurntablePlace) -> tuple[
 
 
 def _batches(places: Sequence[TurntablePlace]) -> list[Batch]:
-    """Places in their order, some at a time and about as many each time, all of one placement of the board."""
+    """Places in their order, some at a time, fewer towards the end, all of a batch of one placement of the board."""
     batches: list[Batch] = []
     for _, group in groupby(places, key=lambda place: place.placement):
         own = list(group)
-        count = -(-len(own) // IMAGES_AT_ONCE)
-        if count >= LEAST_BATCHES:
-            count = -(-count // 4) * 4
-        cuts = [len(own) * k // count for k in range(count + 1)]
-        batches += [own[a:b] for a, b in pairwise(cuts) if b > a]
+        while own:
+            count = min(max(-(-len(own) // 4), LEAST_AT_ONCE), IMAGES_AT_ONCE)
+            batches.append(own[:count])
+            own = own[count:]
     return batches
 
 
@@ -431,7 +457,8 @@ def start_without_stripes(observations: TurntableObservations) -> Start:
 
 def refine(observations: TurntableObservations, start: Start, options: JointOptions | None = None) -> TurntableEstimate:
     """The joint estimate, started from the closed form."""
-    from lidarpose.refine.turntable import JointOptions, refine_turntable
+    from lidarpose.refine.joint_options import JointOptions
+    from lidarpose.refine.turntable import refine_turntable
 
     def restart(other: TurntableObservations) -> Start:
         return start_of(solve(other))

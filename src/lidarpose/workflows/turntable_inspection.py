@@ -34,8 +34,8 @@ from lidarpose.workflows.turntable import (
 
 if TYPE_CHECKING:
     from lidarpose.model.turntable_result import Direction
+    from lidarpose.refine.joint_options import Start
     from lidarpose.refine.prediction import ExpectedNoise, PredictedUncertainty
-    from lidarpose.refine.turntable_joint import Start
 
 # Below this arc the far side of the turn is known centimetres worse than the arc itself.
 _SHORT_ARC_DEG = 5.0
