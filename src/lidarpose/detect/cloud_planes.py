@@ -23,6 +23,7 @@ from lidarpose.geometry.robust import mad_sigma
 from lidarpose.model.plane_patch import PlanePatch
 
 Float32Array = NDArray[np.float32]
+Bits = NDArray[np.uint64]
 
 SAMPLE_SIZE = 4096
 PLANES_AT_ONCE = 16
@@ -92,7 +93,7 @@ class PlaneSearch:
 
 @dataclass(eq=False)
 class _Sample:
-    """A subsample with its hypotheses: planes (H, 4) as normal and offset, and who is near which, (H, S) as 0 or 1.
+    """A subsample with its hypotheses: planes (H, 4) as normal and offset, and who of S is near which, in bits (H, W).
 
     For a dense cloud also what the neighbourhoods of all hypotheses say of the surfaces that they lie on.
     """
@@ -100,7 +101,7 @@ class _Sample:
     indices: IntArray
     points: Float32Array
     planes: FloatArray
-    near: Float32Array
+    near: Bits
     sigma_m: float
     seeds: _Seeds | None = None
     rivals: int = RIVALS
@@ -243,17 +244,37 @@ def _draw(
     return _Sample(indices, points, planes[thin], near, sigma_m, _Seeds(seeds[known], planes[known, :3]))
 
 
-def _near(points: Float32Array, planes: FloatArray, gate_m: float) -> Float32Array:
-    """Which points (S, 3) lie how near to which planes (H, 4): 1 within the gate, else 0, (H, S)."""
-    near = np.empty((len(planes), len(points)), dtype=np.float32)
+def _near(points: Float32Array, planes: FloatArray, gate_m: float) -> Bits:
+    """Which points (S, 3) lie within the gate of which planes (H, 4), in bits (H, W)."""
+    near = np.empty((len(planes), -(-len(points) // 64)), dtype=np.uint64)
     rows, columns = planes.astype(np.float32), np.ascontiguousarray(points.T)
     for first in range(0, len(planes), PLANES_AT_ONCE):
         some = rows[first : first + PLANES_AT_ONCE]
         distance = some[:, :3] @ columns
         distance -= some[:, 3:]
         np.abs(distance, out=distance)
-        near[first : first + PLANES_AT_ONCE] = distance < np.float32(gate_m)
+        near[first : first + PLANES_AT_ONCE] = _bits(distance < np.float32(gate_m))
     return near
+
+
+def _bits(flags: BoolArray) -> Bits:
+    """Flags (..., S) in words of 64 (..., W), the last filled up with zeros."""
+    packed = np.packbits(flags, axis=-1)
+    lacking = -packed.shape[-1] % 8
+    if lacking:
+        packed = np.concatenate([packed, np.zeros((*packed.shape[:-1], lacking), dtype=np.uint8)], axis=-1)
+    return packed.view(np.uint64)
+
+
+def _shared(near: Bits, flags: BoolArray) -> IntArray:
+    """How many (H,) of the flagged points (S,) are near each plane."""
+    both = near & _bits(flags)
+    if hasattr(np, "bitwise_count"):
+        return np.asarray(np.bitwise_count(both).sum(axis=1, dtype=np.int64))
+    return np.asarray(_BITS_OF_BYTE[both.view(np.uint8)].sum(axis=1, dtype=np.int64))  # NumPy 1
+
+
+_BITS_OF_BYTE = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint8)
 
 
 def _neighbourhoods(points: Float32Array, count: int, rng: np.random.Generator) -> tuple[Float32Array, Float32Array]:
@@ -299,42 +320,43 @@ def _noise_from_neighbourhoods(thickness: FloatArray) -> float:
 def _harvest(x: Float32Array, free: BoolArray, sample: _Sample, least: int, at_most: int) -> list[PlanePatch]:
     """Take the patches of one subsample, best first; their points are no longer `free`."""
     patches: list[PlanePatch] = []
-    active = np.ones(len(sample.points), dtype=np.float32)
+    active = np.ones(len(sample.points), dtype=bool)
     scale = max(np.count_nonzero(free) / len(sample.points), 1.0)
     # Fewer points of the subsample than this say too little; a later subsample has more of them.
     least_sample = max(least / scale, 12.0)
     dead = np.zeros(len(sample.planes), dtype=bool)
     while len(patches) < at_most and not dead.all():
-        votes = np.einsum("hs,s->h", sample.near, active)
+        votes = _shared(sample.near, active).astype(np.float32)
         votes[dead] = -1.0
         if votes.max() < least_sample:
             break
         candidate, component, hypothesis = _best_patch(sample, active, votes)
         if component.sum() < least_sample:
-            dead |= sample.near @ component > 0.5 * np.maximum(component.sum(), 1)
+            dead |= _shared(sample.near, component) > 0.5 * np.maximum(component.sum(), 1)
             dead[hypothesis] = True
             continue
         patch = _refit(x, free, candidate, sample, component)
         if patch is None or len(patch) < least:
             dead[hypothesis] = True
-            dead |= sample.near @ component > 0.8 * component.sum()
+            dead |= _shared(sample.near, component) > 0.8 * component.sum()
             # What looked most like a plane here and is none would look so from many sides: no more votes from it.
-            active[component] = 0.0
+            active[component] = False
             continue
         patches.append(patch)
         free[patch.indices] = False
-        active[~free[sample.indices]] = 0.0
+        active &= free[sample.indices]
     return patches
 
 
-def _best_patch(sample: _Sample, active: Float32Array, votes: Float32Array) -> tuple[Plane, BoolArray, int]:
+def _best_patch(sample: _Sample, active: BoolArray, votes: Float32Array) -> tuple[Plane, BoolArray, int]:
     """Of the hypotheses with most votes the one whose largest connected patch is largest, optimised locally."""
     leaders = np.argsort(-votes)[: 6 * sample.rivals : 6]
     best: tuple[int, Plane, BoolArray, int] | None = None
     for leader in leaders:
         if best is not None and votes[leader] <= best[0]:
             break
-        inside = (sample.near[leader] > 0.5) & (active > 0.5)
+        near = np.unpackbits(sample.near[leader].view(np.uint8), count=len(active)).view(bool)
+        inside = near & active
         plane = Plane(sample.planes[leader, :3], sample.planes[leader, 3])
         component = _largest_component(sample.points, inside, plane)
         if best is None or component.sum() > best[0]:
@@ -346,7 +368,7 @@ def _best_patch(sample: _Sample, active: Float32Array, votes: Float32Array) -> t
             break
         plane = _moment_plane(sample.points[component])
         distance = np.abs(sample.points @ plane.normal.astype(np.float32) - np.float32(plane.offset))
-        inside = (distance < GATE_SIGMAS * sample.sigma_m) & (active > 0.5)
+        inside = (distance < GATE_SIGMAS * sample.sigma_m) & active
         component = _largest_component(sample.points, inside, plane)
     return plane, component, leader_index
 
