@@ -31,7 +31,8 @@ def assert_the_same(ways: list[tuple[PlanePatch, ...]]) -> None:
         assert len(np.setxor1d(a.indices, b.indices)) <= MOST_OTHERS * len(a)
         assert angle_between(a.plane.normal, b.plane.normal) < SAME_NORMAL_RAD
         assert a.plane.offset == pytest.approx(b.plane.offset, abs=SAME_OFFSET_M)
-        assert a.sigma_m == pytest.approx(b.sigma_m, rel=1e-4)
+        # A median of ten thousand: the next of them is a ten-thousandth off.
+        assert a.sigma_m == pytest.approx(b.sigma_m, rel=5e-4)
         assert np.all(np.diff(b.indices) > 0)
     assert_apart(quick)
 

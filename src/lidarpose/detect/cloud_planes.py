@@ -198,7 +198,7 @@ def _harvest_dense(
             continue
         # Few voxels of the subsample say little of what a patch is: the cloud has more.
         if len(_one_a_voxel(few[before.indices], GATE_SIGMAS * before.sigma_m)) < ENOUGH_EVIDENCE:
-            local = x[claim.around].astype(np.float32)
+            local = x[claim.around()].astype(np.float32)
             if not _stands_out(local, patch.plane.normal, patch.plane.offset, patch.sigma_m):
                 continue
         found.append(patch)
@@ -331,14 +331,15 @@ def _harvest(x: Float32Array, free: BoolArray, sample: _Sample, least: int, at_m
         if votes.max() < least_sample:
             break
         candidate, component, hypothesis = _best_patch(sample, active, votes)
-        if component.sum() < least_sample:
-            dead |= _shared(sample.near, component) > 0.5 * np.maximum(component.sum(), 1)
+        size = int(np.count_nonzero(component))
+        if size < least_sample:
+            dead |= _shared(sample.near, component) > 0.5 * max(size, 1)
             dead[hypothesis] = True
             continue
         patch = _refit(x, free, candidate, sample, component)
         if patch is None or len(patch) < least:
             dead[hypothesis] = True
-            dead |= _shared(sample.near, component) > 0.8 * component.sum()
+            dead |= _shared(sample.near, component) > 0.8 * size
             # What looked most like a plane here and is none would look so from many sides: no more votes from it.
             active[component] = False
             continue
@@ -359,12 +360,13 @@ def _best_patch(sample: _Sample, active: BoolArray, votes: Float32Array) -> tupl
         inside = near & active
         plane = Plane(sample.planes[leader, :3], sample.planes[leader, 3])
         component = _largest_component(sample.points, inside, plane)
-        if best is None or component.sum() > best[0]:
-            best = int(component.sum()), plane, component, int(leader)
+        size = int(np.count_nonzero(component))
+        if best is None or size > best[0]:
+            best = size, plane, component, int(leader)
     assert best is not None
     _, plane, component, leader_index = best
     for _ in range(sample.refits):
-        if component.sum() < 6:
+        if np.count_nonzero(component) < 6:
             break
         plane = _moment_plane(sample.points[component])
         distance = np.abs(sample.points @ plane.normal.astype(np.float32) - np.float32(plane.offset))

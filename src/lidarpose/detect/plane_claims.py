@@ -9,10 +9,10 @@ first and have no say in either plane: on one side of a seam only, the other fac
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Protocol
 
 import numpy as np
@@ -151,8 +151,12 @@ class _Claims(Protocol):
 
     def held_count(self) -> int: ...
 
-    def some(self, every: int, run: int) -> tuple[IntArray, Float32Array]:
-        """Those in the patch's cells that are in every so manieth run of the cloud's points, and their terms."""
+    def some(self, every: int) -> IntArray:
+        """Of the points in the patch's cells those that are among every so manieth of the cloud's."""
+        ...
+
+    def some_rest(self, every: int, lean: FloatArray) -> Float32Array:
+        """Heights over the leant plane of those in every so manieth run of the cloud's points."""
         ...
 
     def only(self, keep: BoolArray) -> _Claims:
@@ -172,9 +176,12 @@ class _Terms:
     def held_count(self) -> int:
         return int(np.count_nonzero(self.held))
 
-    def some(self, every: int, run: int) -> tuple[IntArray, Float32Array]:
-        few = np.flatnonzero(self.held & _runs(every, run)[self.indices % BLOCK])
-        return self.indices[few], self.terms.take(few, axis=1)
+    def some(self, every: int) -> IntArray:
+        return self.indices[self.held & _runs(every, 1)[self.indices % BLOCK]]
+
+    def some_rest(self, every: int, lean: FloatArray) -> Float32Array:
+        few = np.flatnonzero(self.held & _runs(every, RUN)[self.indices % BLOCK])
+        return _rest(self.terms.take(few, axis=1), lean)
 
     def only(self, keep: BoolArray) -> _Terms:
         return replace(self, held=self.held & keep)
@@ -197,7 +204,10 @@ class _Positions:
 
     @cached_property
     def terms(self) -> Float32Array:
-        return self._terms_of(self.index)
+        rows = self.slab.rows[:4].astype(np.float32)
+        terms = rows[:, :3] @ self.columns.take(self.index, axis=1)
+        terms += rows[:, 3:]
+        return terms
 
     @property
     def held(self) -> BoolArray:
@@ -206,20 +216,19 @@ class _Positions:
     def held_count(self) -> int:
         return len(self.index)
 
-    def some(self, every: int, run: int) -> tuple[IntArray, Float32Array]:
-        few = self.index[_runs(every, run)[self.index]]
-        return few + np.int64(self.first), self._terms_of(few)
+    def some(self, every: int) -> IntArray:
+        return self.indices[_runs(every, 1)[self.index]]
+
+    def some_rest(self, every: int, lean: FloatArray) -> Float32Array:
+        from lidarpose.detect.plane_kernels import heights_of_some
+
+        row = self.slab.turned(lean).astype(np.float32)
+        return np.asarray(heights_of_some(self.columns, self.index, _runs(every, RUN), row))
 
     def only(self, keep: BoolArray) -> _Positions:
         disputed = np.zeros(len(keep), dtype=bool)
         disputed[self.disputed] = True
         return replace(self, index=self.index[keep], disputed=np.flatnonzero(disputed[keep]))
-
-    def _terms_of(self, index: NDArray[np.uint32]) -> Float32Array:
-        rows = self.slab.rows[:4].astype(np.float32)
-        terms = rows[:, :3] @ self.columns.take(index, axis=1)
-        terms += rows[:, 3:]
-        return terms
 
 
 @lru_cache(maxsize=64)
@@ -259,13 +268,16 @@ class Claim:
         Its plane, points and spread.
     variances : (2,)
         Of its points along it, ascending.
-    around : (M,)
-        Indices of some thousand of the points on it and up to twice as far off it, evenly drawn.
     """
 
     patch: PlanePatch
     variances: FloatArray
-    around: IntArray
+    parts: Sequence[_Part]
+
+    def around(self) -> IntArray:
+        """Indices (M,) of some thousand of the points on it and up to twice as far off it, evenly drawn."""
+        held = sum(claims.held_count() for claims, _ in self.parts)
+        return np.concatenate([claims.some(held // EVIDENCE_POINTS + 1) for claims, _ in self.parts])
 
 
 def patches_of_slabs(
@@ -288,9 +300,10 @@ def patches_of_slabs(
     compiled = pays(SAVED_S_PER_POINT_AND_SLAB * len(x) * len(slabs))
     blocks = [slice(first, min(first + BLOCK, len(x))) for first in range(0, len(x), BLOCK)]
     workers = min(os.cpu_count() or 1, len(blocks))
-    claim, members_in = (_claim_compiled, _members_compiled) if compiled else (_claim, _members)
+    claim = _compiled_claims(x, free, slabs) if compiled else partial(_claim, x, free, slabs)
+    members_in = _members_compiled if compiled else _members
     with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(lambda block: claim(x, free, slabs, block), blocks))
+        parts = list(pool.map(claim, blocks))
         of_slabs = list(pool.map(_screened, slabs, ([part[k] for part in parts] for k in range(len(slabs)))))
         fits = list(pool.map(lambda slab, mine: _fit(slab, mine, widest_m), slabs, of_slabs))
         of_blocks = zip(*of_slabs, strict=True)
@@ -302,9 +315,7 @@ def patches_of_slabs(
             patches.append(None)
             continue
         patch = PlanePatch(slabs[k].leant(fit.lean), indices[k], fit.sigma_m)
-        held = sum(claims.held_count() for claims, _ in of_slabs[k])
-        around = [claims.some(held // EVIDENCE_POINTS + 1, 1)[0] for claims, _ in of_slabs[k]]
-        patches.append(Claim(patch, fit.variances, np.concatenate(around)))
+        patches.append(Claim(patch, fit.variances, of_slabs[k]))
     return patches
 
 
@@ -346,26 +357,36 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
     return parts
 
 
-def _claim_compiled(
-    x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab], block: slice
-) -> list[_Part]:
+def _compiled_claims(
+    x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab]
+) -> Callable[[slice], list[_Part]]:
     """`_claim` by kernels, which drop what is not held."""
     from lidarpose.detect.plane_kernels import claims_of_block, columns_of
 
     gates = np.array([[CLAIM_SIGMAS * s.sigma_m, GATE_SIGMAS * s.sigma_m] for s in slabs])
     rows = np.stack([s.rows[1:] for s in slabs])
     rows[:, 0] /= gates[:, :1]
+    single = rows.astype(np.float32)
     allowed = np.concatenate([s.allowed for s in slabs]).view(np.uint8)
     starts = np.cumsum([0] + [len(s.allowed) for s in slabs])
     widths = np.array([s.raster.shape[1] for s in slabs])
-    of_block = np.zeros(0, dtype=bool) if free is None else free[block]
-    columns = columns_of(np.ascontiguousarray(x[block]))
-    held, ends, disputed, disputed_ends, moments = claims_of_block(
-        columns, of_block, rows.astype(np.float32), allowed, starts, widths, gates
-    )
-    mine = np.split(held, ends[:-1])
-    theirs = np.split(disputed, disputed_ends[:-1])
-    return [(_Positions(slab, columns, block.start, mine[k], theirs[k]), moments[k]) for k, slab in enumerate(slabs)]
+    all_free = np.zeros(0, dtype=bool)
+
+    def claim(block: slice) -> list[_Part]:
+        columns = columns_of(np.ascontiguousarray(x[block]))
+        of_block = all_free if free is None else free[block]
+        held, ends, disputed, theirs, moments = claims_of_block(
+            columns, of_block, single, allowed, starts, widths, gates
+        )
+        parts: list[_Part] = []
+        first = first_disputed = 0
+        for k, slab in enumerate(slabs):
+            mine, doubtful = held[first : ends[k]], disputed[first_disputed : theirs[k]]
+            parts.append((_Positions(slab, columns, block.start, mine, doubtful), moments[k]))
+            first, first_disputed = ends[k], theirs[k]
+        return parts
+
+    return claim
 
 
 def _screened(slab: Slab, parts: Sequence[_Part]) -> Sequence[_Part]:
@@ -417,7 +438,7 @@ def _fit(slab: Slab, parts: Sequence[_Part], widest_m: float) -> _Fit | None:
             break
         sums = [_moments(claim, _rest(claim.terms, lean), slab.sigma_m) for claim in claims]
     every = int(count) // SPREAD_POINTS + 1
-    rest = _rest(np.concatenate([claim.some(every, RUN)[1] for claim in claims], axis=1), lean)
+    rest = np.concatenate([claim.some_rest(every, lean) for claim in claims])
     rest = rest[np.abs(rest) < GATE_SIGMAS * slab.sigma_m]
     sigma_m = min(max(mad_sigma(rest, centred=True), 0.5 * slab.sigma_m), widest_m)
     return _Fit(lean, sigma_m, variances)

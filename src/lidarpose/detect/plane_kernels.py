@@ -169,3 +169,18 @@ def members_of(columns: Any, index: Any, disputed: Any, row: Any, first: int, ta
                 taken[i] = True
         start = stop + 1
     return members[:found]
+
+
+@kernel
+def heights_of_some(columns: Any, index: Any, chosen: Any, row: Any) -> Any:
+    """Heights (M,) over a plane of those of the points (3, N) at `index` that are chosen (N,)."""
+    x, y, z = columns[0], columns[1], columns[2]
+    heights = np.empty(len(index), np.float32)
+    a, b, c, d = row[0], row[1], row[2], row[3]
+    found = 0
+    for j in range(len(index)):
+        i = np.uint64(index[j])
+        if chosen[i]:
+            heights[found] = a * x[i] + b * y[i] + c * z[i] + d
+            found += 1
+    return heights[:found]
