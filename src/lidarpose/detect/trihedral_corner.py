@@ -97,10 +97,14 @@ def _candidate(surfaces: list[_Surface], triple: IntArray, corner: FloatArray) -
         if len(around) < MIN_FACE_POINTS or distance.min() > MAX_MISSING_M:
             return None
         local.append(around)
-    convex = _common_side([_next_to_corner(p, local, corner) for p in local], faces)
+    distances = [np.linalg.norm(p - corner, axis=1) for p in local]
+    reach = min(float(np.quantile(d, 0.98)) for d in distances)
+    near = [_next_to_corner(p, d, reach) for p, d in zip(local, distances, strict=True)]
+    convex = _common_side(near, faces)
     if convex is None:
         return None
-    local = [_within_common_reach(p, local, corner) for p in local]
+    # No farther from the corner than the smallest face reaches: a wall's or the ground's rest is no target.
+    local = [p[d <= 1.3 * reach] for p, d in zip(local, distances, strict=True)]
     local = [_on_its_side(p, k, faces, convex) for k, p in enumerate(local)]
     if min(len(p) for p in local) < MIN_FACE_POINTS:
         return None
@@ -137,10 +141,9 @@ def _common_side(local: list[FloatArray], faces: list[PlanePatch]) -> bool | Non
     return convex[0] if len(set(convex)) == 1 else None
 
 
-def _next_to_corner(points: FloatArray, local: list[FloatArray], corner: FloatArray) -> FloatArray:
+def _next_to_corner(points: FloatArray, distance: FloatArray, reach_m: float) -> FloatArray:
     """The points that tell how the faces meet: farther out, a face's plane may go on behind another face."""
-    reach = min(float(np.quantile(np.linalg.norm(p - corner, axis=1), 0.98)) for p in local)
-    close = points[np.linalg.norm(points - corner, axis=1) <= 0.7 * reach]
+    close = points[distance <= 0.7 * reach_m]
     return np.asarray(close) if len(close) >= MIN_FACE_POINTS else points
 
 
@@ -153,12 +156,6 @@ def _on_its_side(points: FloatArray, face: int, faces: list[PlanePatch], convex:
             tolerance = 3.0 * max(faces[face].sigma_m, faces[j].sigma_m)
             keep &= height < tolerance if convex else height > -tolerance
     return np.asarray(points[keep])
-
-
-def _within_common_reach(points: FloatArray, local: list[FloatArray], corner: FloatArray) -> FloatArray:
-    """Points no farther from the corner than the smallest face reaches: a wall's or the ground's rest is no target."""
-    reach = min(float(np.quantile(np.linalg.norm(p - corner, axis=1), 0.98)) for p in local)
-    return np.asarray(points[np.linalg.norm(points - corner, axis=1) <= 1.3 * reach])
 
 
 def convex_outline(points: FloatArray, plane: Plane) -> FloatArray:

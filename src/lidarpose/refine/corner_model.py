@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -124,7 +125,15 @@ class _Face:
 
 def tangents(normal: FloatArray) -> FloatArray:
     """Two unit directions (3, 2) across a normal, along which its tilts are counted."""
-    return np.column_stack(perpendicular_pair(normal))
+    return _tangents(*normal.tolist())
+
+
+@lru_cache(maxsize=64)
+def _tangents(x: float, y: float, z: float) -> FloatArray:
+    """All places share three normals, and each asks for them at each step."""
+    pair = np.column_stack(perpendicular_pair((x, y, z)))
+    pair.setflags(write=False)
+    return pair
 
 
 def face_residuals(returns: FaceReturns, normal: FloatArray, corner: FloatArray) -> FloatArray:
@@ -551,13 +560,11 @@ def estimate_world_sigma(fit: CornerFit) -> tuple[float, float]:
     size = len(gradient) - errors
     information[errors:, errors:] -= np.eye(size)
 
-    def objective(sigma: float) -> float:
-        N = information.copy()
-        N[errors:, errors:] += np.eye(size) / sigma**2
-        return float(np.linalg.slogdet(N)[1] + 2.0 * size * np.log(sigma) - gradient @ np.linalg.solve(N, gradient))
-
     grid = np.geomspace(1e-5, 0.5, 60)
-    values = np.array([objective(s) for s in grid])
+    N = np.repeat(information[None], len(grid), axis=0)
+    N[:, errors:, errors:] += np.eye(size) / grid[:, None, None] ** 2
+    explained = np.linalg.solve(N, np.broadcast_to(gradient, (len(grid), len(gradient)))[..., None])[..., 0] @ gradient
+    values = np.linalg.slogdet(N)[1] + 2.0 * size * np.log(grid) - explained
     best = int(np.argmin(values))
     gain = float(values[0] - values[best])
     return (float(grid[best]), gain) if gain > 0.5 else (0.0, 0.0)
