@@ -81,7 +81,7 @@ def test_the_tail_of_chi_squared_is_that_of_an_independent_library(freedom: floa
     np.testing.assert_allclose(found, chi2.sf(values, freedom), rtol=1e-9, atol=1e-13)
 
 
-@pytest.mark.parametrize("count", [1, 4, 7, 12])
+@pytest.mark.parametrize("count", [1, 4, 7, 12, 599, 600, 601, 4001])
 def test_the_robust_spread_is_the_median_absolute_deviation(count: int) -> None:
     values = np.random.default_rng(count).normal(size=count)
     expected = 1.4826022185056018 * np.median(np.abs(values - np.median(values)))

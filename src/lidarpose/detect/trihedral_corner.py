@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, cross3, perpendicular_pair
+from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.planes import Plane, intersect_three_planes
 from lidarpose.model.corner_result import CornerCandidate
 from lidarpose.model.plane_patch import PlanePatch
@@ -23,6 +24,10 @@ MIN_FACE_POINTS = 12
 # Share of a face's points that have to lie on the right side of the other two.
 ONE_SIDED = 0.9
 OUTLINE_DIRECTIONS = 64
+# A point this far outside of a face's outline, which ends at its last scan line, is still of the face.
+SLACK_M = 0.02
+# By how much kernels are done sooner, on one core.
+SAVED_S_PER_BEAM = 1e-7
 
 
 class _Surface:
@@ -227,6 +232,8 @@ class FaceMask:
         Indices (M,), and the face (M,) of each: 0, 1 or 2.
         """
         rays = np.ascontiguousarray(directions.T)
+        if pays(SAVED_S_PER_BEAM * len(range_m)):
+            return self._select_compiled(rays, range_m, gate_m)
         face, predicted, slope = self._meet(rays)
         with np.errstate(invalid="ignore"):
             chosen = np.flatnonzero(np.abs(range_m - predicted) < gate_m)
@@ -240,6 +247,36 @@ class FaceMask:
             indices.append(mine[good])
             faces.append(np.full(int(np.count_nonzero(good)), j))
         return np.concatenate(indices), np.concatenate(faces)
+
+    def _select_compiled(self, rays: FloatArray, range_m: FloatArray, gate_m: float) -> tuple[IntArray, IntArray]:
+        from lidarpose.detect.target_kernels import faces_met
+
+        edges = [_edges(o, n, SLACK_M) for o, n in zip(self.outlines, self.normals, strict=True)]
+        planes = np.array([[*plane.normal, plane.offset] for plane in self.obstacles]).reshape(-1, 4)
+        found = faces_met(
+            rays,
+            np.asarray(range_m, dtype=np.float64),
+            float(gate_m),
+            np.ascontiguousarray(self.normals),
+            self.normals @ self.corner,
+            bool(self.convex),
+            np.concatenate([inward for inward, _ in edges]),
+            np.concatenate([least for _, least in edges]),
+            np.cumsum([0, *(len(least) for _, least in edges)]),
+            np.array([[self._off_edge_m(j, k) for k in range(3)] for j in range(3)]),
+            planes,
+            np.array([[self._off_obstacle_m(j, plane) for plane in self.obstacles] for j in range(3)]).reshape(3, -1),
+        )
+        indices = [np.flatnonzero(found == j) for j in range(3)]
+        return np.concatenate(indices), np.repeat(np.arange(3), [len(index) for index in indices])
+
+    def _off_edge_m(self, face: int, other: int) -> float:
+        """How far a face's points have to be from another's plane to be off their common edge."""
+        return self.margin_m * float(np.linalg.norm(cross3(self.normals[face], self.normals[other])))
+
+    def _off_obstacle_m(self, face: int, plane: Plane) -> float:
+        """How far a face's points have to be from what borders it."""
+        return max(float(np.linalg.norm(cross3(self.normals[face], plane.normal))), 0.2) * (2.0 * self.margin_m + 0.01)
 
     def meet(self, directions: FloatArray) -> tuple[IntArray, FloatArray]:
         """By direction (N, 3): the face met, and the range there; inf where the beam meets none."""
@@ -272,27 +309,28 @@ class FaceMask:
         `height` (3, N) are their projections onto the three normals.
         """
         normal = self.normals[face]
-        good = in_outline(on_face, self.outlines[face], normal, 0.02)
+        good = in_outline(on_face, self.outlines[face], normal, SLACK_M)
         for k in range(3):
             if k != face:
-                # Distance from the common edge, along this face.
-                sine = float(np.linalg.norm(cross3(normal, self.normals[k])))
-                good &= np.abs(height[k] - self.normals[k] @ self.corner) > self.margin_m * sine
+                good &= np.abs(height[k] - self.normals[k] @ self.corner) > self._off_edge_m(face, k)
         for plane in self.obstacles:
-            sine = max(float(np.linalg.norm(cross3(normal, plane.normal))), 0.2)
-            good &= plane.normal @ on_face - plane.offset > sine * (2.0 * self.margin_m + 0.01)
+            good &= plane.normal @ on_face - plane.offset > self._off_obstacle_m(face, plane)
         return good
 
 
 def in_outline(points: FloatArray, outline: FloatArray, normal: FloatArray, slack_m: float) -> BoolArray:
     """Which points (3, N) of a plane lie in a convex outline (K, 3), widened by `slack_m`."""
+    good = np.ones(points.shape[1], dtype=bool)
+    for edge, offset in zip(*_edges(outline, normal, slack_m), strict=True):
+        good &= edge @ points > offset
+    return good
+
+
+def _edges(outline: FloatArray, normal: FloatArray, slack_m: float) -> tuple[FloatArray, FloatArray]:
+    """Unit directions (E, 3) inward from an outline's edges, and how far along each its points lie at least (E,)."""
     edges = np.roll(outline, -1, axis=0) - outline
     inward = np.cross(normal, edges)
     length = np.linalg.norm(inward, axis=1)
     keep = length > 1e-9
     inward = inward[keep] / length[keep, None]
-    least = np.einsum("ij,ij->i", inward, outline[keep]) - slack_m
-    good = np.ones(points.shape[1], dtype=bool)
-    for edge, offset in zip(inward, least, strict=True):
-        good &= edge @ points > offset
-    return good
+    return inward, np.einsum("ij,ij->i", inward, outline[keep]) - slack_m

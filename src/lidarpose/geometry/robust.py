@@ -14,6 +14,8 @@ from lidarpose.geometry.arrays import BoolArray, FloatArray
 
 # Makes the median absolute deviation of a normal distribution its standard deviation.
 MAD_TO_SIGMA = 1.4826022185056018
+# Of fewer values the median is found soonest in one call.
+FEW_VALUES = 600
 
 
 def mad_sigma(values: ArrayLike, *, centred: bool = False) -> float:
@@ -28,11 +30,15 @@ def mad_sigma(values: ArrayLike, *, centred: bool = False) -> float:
 def median(values: FloatArray) -> float:
     """As numpy's, of all values, at a fraction of its overhead; NaN where a value is."""
     n = values.size
-    # NaN sorts last.
-    ordered = np.partition(values, [(n - 1) // 2, n // 2, n - 1], axis=None)
-    if np.isnan(ordered[-1]):
-        return float("nan")
-    return 0.5 * float(ordered[(n - 1) // 2] + ordered[n // 2])
+    k = n // 2
+    # NaN sorts last. About one place NumPy divides with vector instructions, about several without.
+    if n < FEW_VALUES:
+        ordered = np.partition(values, [(n - 1) // 2, k, n - 1], axis=None)
+        low, last = ordered[(n - 1) // 2], ordered[-1]
+    else:
+        ordered = np.partition(values, k, axis=None)
+        low, last = ordered[k] if n % 2 else ordered[:k].max(), ordered[k:].max()
+    return float("nan") if np.isnan(last) else 0.5 * float(low + ordered[k])
 
 
 def row_medians(values: FloatArray, there: BoolArray) -> FloatArray:

@@ -9,9 +9,9 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
+from lidarpose.detect.crop import inside_box
 from lidarpose.detect.edge_corner import find_edge_corners
 from lidarpose.detect.trihedral_corner import FaceMask, find_corners
 from lidarpose.errors import UndeterminedError
@@ -113,7 +113,9 @@ class PlaceCrop:
         count = len(self.frame)
         if count < 1.5 * most:
             return self
-        index = np.flatnonzero((np.arange(count) * GOLDEN) % 1.0 < most / count)
+        turns = np.arange(count) * GOLDEN
+        turns -= np.floor(turns)
+        index = np.flatnonzero(turns < most / count)
         return PlaceCrop(self.points[index], self.frame[index], self.frames)
 
 
@@ -346,24 +348,13 @@ def gather(session: CornerSession, found: FoundTarget, *, tick: Tick = lambda: N
             low, high = outlines.min(axis=0) - margin_m, outlines.max(axis=0) + margin_m
         parts = []
         for source in place.clouds:
-            parts.append(_inside_box(source.load().points, low, high))
+            parts.append(inside_box(source.load().points, low, high))
             tick()
         frame = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
         return PlaceCrop(np.concatenate(parts, dtype=np.float64), frame, len(parts))
 
     with ThreadPoolExecutor(2) as pool:
         return tuple(pool.map(crop, zip(session.places, corners, found.sightings, strict=True)))
-
-
-def _inside_box(points: NDArray[np.floating], low: FloatArray, high: FloatArray) -> NDArray[np.floating]:
-    """Points (M, 3) in a box: most fall out by one coordinate alone, those without return too."""
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    # The farther the box lies out along an axis for its size, the fewer points share that coordinate.
-    with np.errstate(invalid="ignore"):
-        for k in np.argsort(-np.abs(middle) / half):
-            x = points[:, k] - points.dtype.type(middle[k])
-            points = points.take(np.flatnonzero(np.abs(x, out=x) < half[k]), axis=0)
-    return points
 
 
 def expected_corners(found: FoundTarget) -> FloatArray:

@@ -1,0 +1,90 @@
+"""Cutting out the target and telling its faces' beams: kernels and NumPy select the same."""
+
+import numpy as np
+import pytest
+
+from lidarpose.detect.crop import inside_box
+from lidarpose.detect.trihedral_corner import FaceMask
+from lidarpose.geometry import compiled
+from lidarpose.geometry.arrays import FloatArray, unit
+from lidarpose.geometry.planes import Plane
+from lidarpose.geometry.se3 import Pose
+from lidarpose.simulate.corner_scene import CornerSceneSpec, simulate_corner_session
+from lidarpose.workflows.world import calibrate_world
+
+pytestmark = pytest.mark.skipif(not compiled.installed(), reason="numba is not installed")
+
+
+def some_mask(rng: np.random.Generator, convex: bool) -> FaceMask:
+    """A cube's corner some metres away that shows three faces from outside or inside, with ground at its foot."""
+    corner = rng.uniform(1.5, 3.0, 3) * rng.choice([-1.0, 1.0], 3)
+    towards = unit(corner)
+    axes = Pose.exp(np.concatenate([np.zeros(3), rng.normal(size=3)])).rotation
+    normals = np.stack([-a * np.sign(a @ towards) for a in axes.T])
+    along = -normals if convex else normals
+    outlines = []
+    for k in range(3):
+        u, v = along[(k + 1) % 3], along[(k + 2) % 3]
+        angle = np.linspace(0.0, 2.0 * np.pi, 17)[:-1]
+        outlines.append(corner + 0.3 * (1.0 + np.cos(angle)[:, None]) * u + 0.3 * (1.0 + np.sin(angle)[:, None]) * v)
+    # As corners of faces come: in order as seen from the normal's side.
+    ordered = [o if _area(o, n) > 0.0 else o[::-1] for o, n in zip(outlines, normals, strict=True)]
+    ground = Plane(normals[0], float(normals[0] @ (corner + 0.4 * along[0])))
+    obstacles = (ground,) if rng.random() < 0.5 else ()
+    return FaceMask(corner, normals, convex, (ordered[0], ordered[1], ordered[2]), obstacles, 0.005)
+
+
+def _area(outline: FloatArray, normal: FloatArray) -> float:
+    return float(np.cross(outline, np.roll(outline, -1, axis=0)).sum(axis=0) @ normal)
+
+
+@pytest.mark.parametrize("convex", [True, False])
+@pytest.mark.parametrize("gate_m", [0.03, np.inf])
+def test_the_same_beams_are_of_each_face(convex: bool, gate_m: float) -> None:
+    rng = np.random.default_rng(5)
+    selected = 0
+    for _ in range(10):
+        mask = some_mask(rng, convex)
+        directions = unit(mask.corner + rng.uniform(-0.8, 0.8, (4000, 3)))
+        with np.errstate(invalid="ignore"):
+            range_m = mask.meet(directions)[1] + rng.normal(0.0, 0.02, len(directions))
+        with compiled.forced(False):
+            index, face = mask.select(directions, range_m, gate_m)
+        with compiled.forced(True):
+            quick_index, quick_face = mask.select(directions, range_m, gate_m)
+        np.testing.assert_array_equal(quick_index, index)
+        np.testing.assert_array_equal(quick_face, face)
+        selected += len(index)
+    assert selected > 3000
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_same_points_are_in_a_box(dtype: type) -> None:
+    rng = np.random.default_rng(6)
+    points = rng.uniform(-4.0, 4.0, (20_000, 3)).astype(dtype)
+    points[::7] = np.nan
+    points[::11, 1] = np.inf
+    points[5], points[6] = [0.5, 1.0, -2.0], [1.5, 2.0, -1.0]  # just on the border, which is not inside
+    for _ in range(20):
+        low = rng.uniform(-4.0, 2.0, 3)
+        high = low + rng.uniform(0.5, 3.0, 3)
+        with compiled.forced(False):
+            expected = inside_box(points, low, high)
+        with compiled.forced(True):
+            found = inside_box(points, low, high)
+        assert found.dtype == dtype
+        np.testing.assert_array_equal(found, expected)
+    assert len(expected) > 10
+    with compiled.forced(True):
+        border = inside_box(points[5:7], np.array([0.5, 1.0, -2.0]), np.array([1.5, 2.0, -1.0]))
+    assert len(border) == 0
+
+
+def test_a_calibration_is_the_same_to_the_bit() -> None:
+    session, _ = simulate_corner_session(CornerSceneSpec(pose="1", frames=2, places=4, seed=4))
+    found = []
+    for way in (False, True):
+        with compiled.forced(way):
+            found.append(calibrate_world(session))
+    np.testing.assert_array_equal(found[0].T_world_source.matrix, found[1].T_world_source.matrix)
+    np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
