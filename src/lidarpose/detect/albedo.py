@@ -63,21 +63,38 @@ class PanelAlbedo:
         light, dark = (sample(table, grid + 0.5) for table in (self.light, self.dark))
         return light, dark
 
-    def light_share(self, x: FloatArray, y: FloatArray, edge_x: FloatArray, edge_y: FloatArray) -> FloatArray:
+    def near_ends(
+        self,
+        x_range: tuple[FloatArray, FloatArray],
+        y_range: tuple[FloatArray, FloatArray],
+        edges: tuple[FloatArray, ...],
+    ) -> BoolArray:
+        """Whether any grid coordinates between bounds are near the squares' lower and upper end: (2, 2), x and y."""
+        near = np.zeros((2, 2), dtype=bool)
+        sizes = (self.grid_map.columns, self.grid_map.rows)
+        for k, ((low, high), edge, size) in enumerate(zip((x_range, y_range), edges, sizes, strict=True)):
+            reach = 4.0 * float(np.max(edge))
+            near[k] = float(np.min(low)) < -1.0 + reach, float(np.max(high)) > size - reach
+        return near
+
+    def light_share(
+        self, x: FloatArray, y: FloatArray, edge_x: FloatArray, edge_y: FloatArray, *, near: BoolArray | None = None
+    ) -> FloatArray:
         """Share from 0 (all dark) to 1 (all light) of what is seen at grid coordinates `x`, `y` (arrays of one shape).
 
         Edges are blurred by Gaussians of width `edge_x`, `edge_y` squares. The blur is taken to be small against the
-        squares, so that only the nearest edge each way matters.
+        squares, so that only the nearest edge each way matters. `near` is what `near_ends` says, if it is known.
         """
+        if near is None:
+            near = self.near_ends((x, x), (y, y), (edge_x, edge_y))
         columns, rows = self.grid_map.columns, self.grid_map.rows
         inner_x, inner_y = np.clip(x, -0.5, columns - 0.5), np.clip(y, -0.5, rows - 0.5)
         wave = soft_square_wave(inner_x, edge_x) * soft_square_wave(inner_y, edge_y)
         share = 0.5 - 0.5 * wave if self.first_is_dark else 0.5 + 0.5 * wave
-        for value, edge, size in ((x, edge_x, columns), (y, edge_y, rows)):
-            reach = 4.0 * float(np.max(edge))
-            if float(np.min(value)) < -1.0 + reach:
+        for value, edge, size, (at_low, at_high) in ((x, edge_x, columns, near[0]), (y, edge_y, rows, near[1])):
+            if at_low:
                 share = 1.0 - (1.0 - share) * _soft_step(value + 1.0, edge)
-            if float(np.max(value)) > size - reach:
+            if at_high:
                 share = 1.0 - (1.0 - share) * _soft_step(size - value, edge)
         return np.asarray(share)
 
@@ -114,9 +131,14 @@ def _ring_centre(index: IntArray, shape: IntArray) -> FloatArray:
 
 
 @lru_cache(maxsize=1)
-def _erf_table() -> FloatArray:
+def erf_table() -> FloatArray:
     values = [math.erf(x) for x in np.linspace(-_ERF_REACH, _ERF_REACH, 2 * _ERF_STEPS + 1).tolist()]
     return np.asarray(values, dtype=np.float32)
+
+
+def edge_scale(sigma: FloatArray) -> FloatArray:
+    """Steps of `erf_table` a square, at an edge blurred by `sigma` squares."""
+    return np.asarray(_ERF_STEPS / (_ERF_REACH * _SQRT2) / np.maximum(sigma, 1e-6))
 
 
 def soft_square_wave(x: FloatArray, sigma: FloatArray) -> FloatArray:
@@ -124,16 +146,14 @@ def soft_square_wave(x: FloatArray, sigma: FloatArray) -> FloatArray:
     half = 0.5 * x + 0.25
     # Distance to the nearest edge, positive on the side where the wave is 1.
     distance = 0.5 - np.abs(2.0 * (half - np.floor(half)) - 1.0)
-    scale = _ERF_STEPS / (_ERF_REACH * _SQRT2) / np.maximum(sigma, 1e-6)
-    index = np.clip(distance * scale + (_ERF_STEPS + 0.5), 0, 2 * _ERF_STEPS).astype(np.intp)
-    return np.asarray(_erf_table()[index])
+    index = np.clip(distance * edge_scale(sigma) + (_ERF_STEPS + 0.5), 0, 2 * _ERF_STEPS).astype(np.intp)
+    return np.asarray(erf_table()[index])
 
 
 def _soft_step(x: FloatArray, sigma: FloatArray) -> FloatArray:
     """Step from 0 (x < 0) to 1, blurred by a Gaussian (`sigma`)."""
-    scale = _ERF_STEPS / (_ERF_REACH * _SQRT2) / np.maximum(sigma, 1e-6)
-    index = np.clip(x * scale + (_ERF_STEPS + 0.5), 0, 2 * _ERF_STEPS).astype(np.intp)
-    return np.asarray(0.5 + 0.5 * _erf_table()[index])
+    index = np.clip(x * edge_scale(sigma) + (_ERF_STEPS + 0.5), 0, 2 * _ERF_STEPS).astype(np.intp)
+    return np.asarray(0.5 + 0.5 * erf_table()[index])
 
 
 def measure_albedo(grid_map: GridMap, image: GrayImage | FloatArray) -> PanelAlbedo:

@@ -13,11 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidarpose.detect.albedo import PanelAlbedo, edge_scale, erf_table
 from lidarpose.detect.stripe_search import CoarseLine, PanelView
 from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.robust import MAD_TO_SIGMA
 from lidarpose.model.image import GrayImage
 
+# Pixels above this share of the sensor's limit are saturated.
+_BELOW_LIMIT = 0.98
 # Profiles of a band, about, that the width, the squares' colours and a first curve are found from.
 _FEW = 250
 
@@ -131,10 +135,22 @@ def as_pixels(u: FloatArray, v: FloatArray, steep: bool) -> FloatArray:
 
 def cut(source: Source, ranges: Ranges, curves: Curves, half: FloatArray) -> Bands:
     """Profiles of 2 half + 1 pixels about the curves; `half` (B,) may differ from band to band."""
+    slope = curves.slope(ranges.u)
+    cosine = 1.0 / np.sqrt(1.0 + slope**2)
+    v, values, bright, good = (_cut_compiled if pays(0.0) else _cut)(source, ranges, curves.at(ranges.u), half)
+    nothing = np.zeros_like(values)
+    return Bands(ranges.u, ranges.valid, v, values, bright, good, nothing, cosine, slope * cosine, nothing)
+
+
+_Tables = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Pixel coordinates, values, the bright image, and which count: (P, B, N), float32."""
+
+
+def _cut(source: Source, ranges: Ranges, centre: FloatArray, half: FloatArray) -> _Tables:
     view, steep = source.view, source.steep
     reach = int(half.max())
     offsets = np.arange(-reach, reach + 1)[:, None, None]
-    v = np.rint(curves.at(ranges.u)).astype(np.intp) + offsets
+    v = np.rint(centre).astype(np.intp) + offsets
     across = 0 if steep else 1
     safe = np.clip(v, view.low[across], view.high[across] - 1)
     along = ranges.u.astype(np.intp)
@@ -143,14 +159,21 @@ def cut(source: Source, ranges: Ranges, curves: Curves, half: FloatArray) -> Ban
     values = np.stack([image.take(index[:, b]) for b, image in enumerate(source.images)], axis=1)
     bright = view.bright.take((rows - view.low[1]) * view.bright.shape[1] + (columns - view.low[0]))
     within = ranges.valid & (np.abs(offsets) <= half[:, None])
-    good = ((v == safe) & (values < 0.98 * source.limit) & within).astype(np.float32)
-    slope = curves.slope(ranges.u)
-    cosine = 1.0 / np.sqrt(1.0 + slope**2)
-    values = values.astype(np.float32)
-    nothing = np.zeros_like(values)
-    return Bands(
-        ranges.u, ranges.valid, v.astype(np.float32), values, bright, good, nothing, cosine, slope * cosine, nothing
-    )
+    good = ((v == safe) & (values < _BELOW_LIMIT * source.limit) & within).astype(np.float32)
+    return v.astype(np.float32), values.astype(np.float32), bright, good
+
+
+def _cut_compiled(source: Source, ranges: Ranges, centre: FloatArray, half: FloatArray) -> _Tables:
+    """`_cut` by kernels."""
+    from lidarpose.detect import stripe_kernels
+
+    view, reach = source.view, int(half.max())
+    v, values, bright, good = (np.empty((2 * reach + 1, *centre.shape), np.float32) for _ in range(4))
+    for b, image in enumerate(source.images):
+        where = (source.steep, view.low, view.high, _BELOW_LIMIT * source.limit, b)
+        profiles = (ranges.u, centre, ranges.valid, int(half[b]), reach)
+        stripe_kernels.cut_band(image, view.bright, *where, *profiles, v, values, bright, good)
+    return v, values, bright, good
 
 
 def _half_heights(curves: Curves, ranges: Ranges, width: FloatArray) -> FloatArray:
@@ -162,8 +185,7 @@ def _half_heights(curves: Curves, ranges: Ranges, width: FloatArray) -> FloatArr
 def bands_about(source: Source, ranges: Ranges, curves: Curves, width: FloatArray) -> Bands:
     """The bands about good curves, with the ambient light taken out and the first backgrounds."""
     bands = cut(source, ranges, curves, _half_heights(curves, ranges, width))
-    flank = bands.good * (np.abs(distance_from(bands, curves.at(bands.u))) > for_table(2.7 * width))
-    ambient = _ambient(bands, flank, curves)
+    ambient = _ambient(bands, 2.7 * width, curves)
     return replace(bands, values=bands.values - ambient, ambient=ambient)
 
 
@@ -216,18 +238,32 @@ def spreads(values: FloatArray, which: BoolArray) -> FloatArray:
     return MAD_TO_SIGMA * quantiles(np.abs(values), which, 0.5)
 
 
-def _ambient(bands: Bands, flank: FloatArray, curves: Curves) -> FloatArray:
-    """The bright image times a share that changes slowly along the stripe, from the pixels beside it (`flank`)."""
-    count = np.maximum(flank.sum(axis=0), 1.0)
-    values, bright = (flank * (x - (x * flank).sum(axis=0) / count) for x in (bands.values, bands.bright))
+def _ambient(bands: Bands, beyond: FloatArray, curves: Curves) -> FloatArray:
+    """The bright image times a share that changes slowly along the stripe, from the pixels `beyond` (B,) this distance
+    from it."""
+    own, cross = _ambient_products(bands, curves.at(bands.u), beyond)
     s = (bands.u - curves.middle) / curves.half
     powers = np.stack([np.ones_like(s), s, s**2], axis=2)
-    own, cross = np.einsum("pbn,pbn->bn", bright, bright), np.einsum("pbn,pbn->bn", bright, values)
     normal = (powers * own[..., None]).swapaxes(1, 2) @ powers
     # Flat profiles tell nothing: a weak pull towards no ambient light.
     normal += np.eye(3) * (1e-6 * np.trace(normal, axis1=1, axis2=2) + 1.0)[:, None, None]
     share = np.linalg.solve(normal, powers.swapaxes(1, 2) @ cross[..., None].astype(np.float64))
     return np.asarray(for_table((powers @ share)[..., 0]) * bands.bright)
+
+
+def _ambient_products(bands: Bands, centre: FloatArray, beyond: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Sums (B, N) of bright * bright and bright * values over the pixels beside the stripe, both less their means."""
+    if pays(0.0):
+        from lidarpose.detect import stripe_kernels
+
+        own, cross = np.empty(centre.shape, np.float32), np.empty(centre.shape, np.float32)
+        profiles = (for_table(centre), for_table(bands.cosine), np.asarray(beyond, dtype=np.float32))
+        stripe_kernels.ambient_products(bands.v, bands.values, bands.bright, bands.good, *profiles, own, cross)
+        return own, cross
+    flank = bands.good * (np.abs(distance_from(bands, centre)) > for_table(beyond))
+    count = np.maximum(flank.sum(axis=0), 1.0)
+    values, bright = (flank * (x - (x * flank).sum(axis=0) / count) for x in (bands.values, bands.bright))
+    return np.einsum("pbn,pbn->bn", bright, bright), np.einsum("pbn,pbn->bn", bright, values)
 
 
 def look_at_albedo(bands: Bands, source: Source, curves: Curves, width: FloatArray) -> Bands:
@@ -245,13 +281,38 @@ def look_at_albedo(bands: Bands, source: Source, curves: Curves, width: FloatArr
     thickness = (1.0 - blur2 / width**2)[:, None]
     edges = np.sqrt(blur2[:, None, None] * (thickness[..., None] * across**2 + along**2))
     # A pixel at (0, dv) from the centre is seen at dv along the stripe's tangent plus `thickness` of it across.
-    dv = bands.v - for_table(centre)
     per_v = by_v * (cosine**2 * thickness + sine**2)[..., None]
     per_v = per_v + by_u * ((1.0 - thickness) * cosine * sine)[..., None]
     inside = _inside_squares(view, grid, across, width)
-    x, y = (dv * for_table(per_v[..., k]) + for_table(grid[..., k]) for k in (0, 1))
-    light = albedo.light_share(x, y, for_table(edges[..., 0]), for_table(edges[..., 1]))
+    columns = [tuple(for_table(table[..., k]) for k in (0, 1)) for table in (grid, per_v, edges)]
+    light = _light_shares(bands, albedo, for_table(centre), *columns)
     return replace(bands, cosine=cosine, sine=sine, light=light, good=bands.good * inside)
+
+
+_Two = tuple[FloatArray, ...]
+"""Tables (B, N), float32, for x and for y."""
+
+
+def _light_shares(
+    bands: Bands, albedo: PanelAlbedo, centre: FloatArray, grid: _Two, per_v: _Two, edges: _Two
+) -> FloatArray:
+    """Share of light surface (P, B, N) at pixels; `grid` at the centre, its change `per_v`, and the edges' blur."""
+    # No pixel of a band is further from the centre than this.
+    reach = bands.half + 1.0
+    x_range, y_range = ((g - reach * np.abs(d), g + reach * np.abs(d)) for g, d in zip(grid, per_v, strict=True))
+    near = albedo.near_ends(x_range, y_range, edges)
+    if pays(0.0):
+        from lidarpose.detect import stripe_kernels
+
+        scales = np.stack([edge_scale(edge) for edge in edges])
+        light = np.empty_like(bands.v)
+        size = np.array([albedo.grid_map.columns, albedo.grid_map.rows], dtype=np.float32)
+        places = (centre, np.stack(grid), np.stack(per_v), scales, size)
+        stripe_kernels.light_shares(bands.v, *places, near, albedo.first_is_dark, erf_table(), light)
+        return light
+    dv = bands.v - centre
+    x, y = (dv * d + g for g, d in zip(grid, per_v, strict=True))
+    return albedo.light_share(x, y, *edges, near=near)
 
 
 def _inside_squares(view: PanelView, grid: FloatArray, across: FloatArray, width: FloatArray) -> FloatArray:

@@ -34,9 +34,10 @@ from lidarpose.detect.stripe_bands import (
     spreads,
     usable_ranges,
 )
-from lidarpose.detect.stripe_noise import learn_noise
+from lidarpose.detect.stripe_noise import learn_noise, sampled
 from lidarpose.detect.stripe_search import CoarseLine, PanelView
 from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.robust import MAD_TO_SIGMA, tukey_weights
 from lidarpose.model.image import GrayImage
 from lidarpose.model.observation import StripePoints
@@ -238,15 +239,12 @@ def _first_curves(bands: Bands, share: FloatArray, straight: Curves) -> tuple[Cu
 def _start(bands: Bands, curves: Curves, width: FloatArray, ratio: FloatArray, noise: FloatArray | None) -> _State:
     """Heights and backgrounds by least squares with all else as given; a guess of the noise from the pixels beside."""
     centre = curves.at(bands.u)
-    distance = distance_from(bands, centre) * for_table(1.0 / width)
-    bell = np.exp(np.float32(-0.5) * distance * distance) * (for_table(ratio) + for_table(1.0 - ratio) * bands.light)
-    weighted = bands.good * bell
-    n, b, v = (np.einsum("pbn,pbn->bn", bands.good, x) for x in (np.ones_like(bell), bell, bands.values))
-    bb, bv = (np.einsum("pbn,pbn->bn", weighted, x) for x in (bell, bands.values))
+    n, b, v, bb, bv = _start_sums(bands, centre, width, ratio)
     det = np.maximum(n * bb - b * b, 1e-3)
     height = np.maximum((n * bv - b * v) / det, 1.0)
     background = (v - height * b) / np.maximum(n, 1.0)
     if noise is None:
+        distance = distance_from(bands, centre) * for_table(1.0 / width)
         flank = bands.good * (np.abs(distance) > 2.7)
         rest = np.abs(bands.values - for_table(background)) * flank
         reading = 1.25 * rest.sum(axis=(0, 2)) / np.maximum(flank.sum(axis=(0, 2)), 1.0)
@@ -254,26 +252,36 @@ def _start(bands: Bands, curves: Curves, width: FloatArray, ratio: FloatArray, n
     return _State(height, centre, background, width, ratio, noise, np.ones_like(centre))
 
 
+def _start_sums(bands: Bands, centre: FloatArray, width: FloatArray, ratio: FloatArray) -> Sequence[FloatArray]:
+    """Sums over each profile's good pixels: 1, bell, values, bell^2 and bell * values, (B, N) each."""
+    if pays(0.0):
+        from lidarpose.detect import stripe_kernels
+
+        bell = _bell_compiled(bands, centre, width)
+        each = np.stack([ratio, 1.0 - ratio], axis=1).astype(np.float32)
+        sums = np.empty((5, *centre.shape), np.float32)
+        stripe_kernels.start_sums(bands.values, bands.good, bands.light, bell, each, sums)
+        return list(sums)
+    distance = distance_from(bands, centre) * for_table(1.0 / width)
+    bell = np.exp(np.float32(-0.5) * distance * distance) * (for_table(ratio) + for_table(1.0 - ratio) * bands.light)
+    weighted = bands.good * bell
+    plain = [np.einsum("pbn,pbn->bn", bands.good, x) for x in (np.ones_like(bell), bell, bands.values)]
+    return plain + [np.einsum("pbn,pbn->bn", weighted, x) for x in (bell, bands.values)]
+
+
+def _bell_compiled(bands: Bands, centre: FloatArray, width: FloatArray) -> FloatArray:
+    """exp(-d^2 / 2) (P, B, N) of the pixels' distances in widths, by kernels and NumPy's own exponential."""
+    from lidarpose.detect import stripe_kernels
+
+    bell = np.empty_like(bands.v)
+    by_width = np.asarray(1.0 / width, dtype=np.float32)
+    stripe_kernels.exponents(bands.v, for_table(centre), for_table(bands.cosine), by_width, bell)
+    return np.exp(bell, out=bell)
+
+
 def _step(bands: Bands, state: _State, curves: Curves, *, learn: bool) -> _State:
     """One Gauss-Newton step; with `learn`, the noise is learnt again first."""
-    distance = distance_from(bands, state.centre) * for_table(1.0 / state.width)
-    squared = distance * distance
-    bell = np.exp(np.float32(-0.5) * squared)
-    ratio, height = for_table(state.dark_ratio), for_table(state.height)
-    by_height = bell * (ratio + (1 - ratio) * bands.light)
-    signal = height * by_height
-    residual = bands.values - for_table(state.background) - signal
-    level = np.maximum(bands.values + bands.ambient, np.float32(0.0))
-    noise = learn_noise(residual, level, signal, bands.good, state.noise) if learn else state.noise
-    variance = for_table(noise[:, 0]) + for_table(noise[:, 1]) * level + for_table(noise[:, 2]) * signal * signal
-    weight = bands.good / variance
-    J = [
-        np.ones_like(signal),
-        by_height,
-        signal * distance * for_table(bands.cosine / state.width[:, None]),
-        signal * squared,
-    ]
-    M = _normal_equations(J, residual, weight)
+    M, noise = (_equations_compiled if pays(0.0) else _equations)(bands, state, learn=learn)
     M[_BACKGROUND][0] += 1e-9
     M[_HEIGHT][0] += 1e-9
     M[_CENTRE][0] += 1.0 / _PULL_PX**2
@@ -288,6 +296,64 @@ def _step(bands: Bands, state: _State, curves: Curves, *, learn: bool) -> _State
         noise,
         information,
     )
+
+
+def _equations(bands: Bands, state: _State, *, learn: bool) -> tuple[list[FloatArray], FloatArray]:
+    """`_normal_equations` of the next step, and the noise (B, 3) that its weights are for."""
+    distance = distance_from(bands, state.centre) * for_table(1.0 / state.width)
+    squared = distance * distance
+    bell = np.exp(np.float32(-0.5) * squared)
+    ratio, height = for_table(state.dark_ratio), for_table(state.height)
+    by_height = bell * (ratio + (1 - ratio) * bands.light)
+    signal = height * by_height
+    residual = bands.values - for_table(state.background) - signal
+    level = np.maximum(bands.values + bands.ambient, np.float32(0.0))
+    noise = state.noise
+    if learn:
+        samples = [tuple(x[:, b].ravel()[k] for x in (residual, level, signal)) for b, k in sampled(bands.good)]
+        noise = learn_noise(samples, state.noise)
+    variance = for_table(noise[:, 0]) + for_table(noise[:, 1]) * level + for_table(noise[:, 2]) * signal * signal
+    weight = bands.good / variance
+    J = [
+        np.ones_like(signal),
+        by_height,
+        signal * distance * for_table(bands.cosine / state.width[:, None]),
+        signal * squared,
+    ]
+    return _normal_equations(J, residual, weight), noise
+
+
+def _equations_compiled(bands: Bands, state: _State, *, learn: bool) -> tuple[list[FloatArray], FloatArray]:
+    """`_equations` by kernels."""
+    from lidarpose.detect import stripe_kernels
+
+    bell = _bell_compiled(bands, state.centre, state.width)
+    noise = learn_noise(_samples(bands, state, bell), state.noise) if learn else state.noise
+    ratio = np.asarray(state.dark_ratio, dtype=np.float32)
+    each = np.column_stack(
+        [np.asarray(1.0 / state.width, dtype=np.float32), ratio, 1 - ratio, noise.astype(np.float32)]
+    )
+    profiles = (state.centre, bands.cosine, bands.cosine / state.width[:, None], state.height, state.background)
+    rows = np.empty((14, *state.centre.shape), np.float32)
+    centre, cosine, slant, height, background = (for_table(x) for x in profiles)
+    tables = (bands.v, bands.values, bands.ambient, bands.good, bands.light, bell)
+    stripe_kernels.normal_equations(*tables, centre, cosine, slant, height, background, each, rows)
+    doubles = rows.astype(np.float64)
+    return [doubles[a:b] for a, b in ((0, 5), (5, 9), (9, 12), (12, 14))], noise
+
+
+def _samples(bands: Bands, state: _State, bell: FloatArray) -> list[tuple[FloatArray, ...]]:
+    """Residual, level and signal of some pixels of each band, as `_equations` has them of all."""
+    found: list[tuple[FloatArray, ...]] = []
+    count = bands.v.shape[2]
+    for b, k in sampled(bands.good):
+        n = k % count
+        values, ambient, light, peak = (x[:, b].ravel()[k] for x in (bands.values, bands.ambient, bands.light, bell))
+        ratio = np.float32(state.dark_ratio[b])
+        height, background = (np.asarray(x[b], dtype=np.float32)[n] for x in (state.height, state.background))
+        signal = height * (peak * (ratio + (1 - ratio) * light))
+        found.append((values - background - signal, np.maximum(values + ambient, np.float32(0.0)), signal))
+    return found
 
 
 def _normal_equations(J: Sequence[FloatArray], residual: FloatArray, weight: FloatArray) -> list[FloatArray]:

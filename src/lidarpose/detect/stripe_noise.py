@@ -5,22 +5,31 @@ The variance of a pixel is r^2 + g * level + (s * signal)^2.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from itertools import product
 
 import numpy as np
 
-from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.robust import MAD_TO_SIGMA
 
 # Pixels that the noise is learnt from, and the bins they are sorted into.
 _NOISE_SAMPLES, _NOISE_BINS = 1200, 8
 
 
-def learn_noise(
-    residual: FloatArray, level: FloatArray, signal: FloatArray, good: FloatArray, before: FloatArray
-) -> FloatArray:
-    """Variance as r^2 + g * level + s^2 * signal^2 (all >= 0), from residuals sorted into bins by the signal."""
-    bins = [_noise_bins(*(x[:, b].ravel() for x in (residual, level, signal, good))) for b in range(len(before))]
+def sampled(good: FloatArray) -> Iterator[tuple[int, IntArray]]:
+    """Each band b of a table (P, B, N) of good pixels, and flat indices (M,) into its [:, b] of some of them."""
+    for b in range(good.shape[1]):
+        some = np.flatnonzero(good[:, b])
+        yield b, some[:: max(len(some) // _NOISE_SAMPLES, 1)]
+
+
+def learn_noise(samples: Sequence[tuple[FloatArray, ...]], before: FloatArray) -> FloatArray:
+    """Variance as r^2 + g * level + s^2 * signal^2 (all >= 0), from residuals sorted into bins by the signal.
+
+    `samples` are residual, level and signal (M,) of some pixels of each band.
+    """
+    bins = [_noise_bins(*found) for found in samples]
     learnt = np.array([b for b, found in enumerate(bins) if found is not None], dtype=np.intp)
     noise = before.copy()
     if len(learnt):
@@ -31,14 +40,11 @@ def learn_noise(
     return noise
 
 
-def _noise_bins(residual: FloatArray, level: FloatArray, signal: FloatArray, good: FloatArray) -> FloatArray | None:
+def _noise_bins(residual: FloatArray, level: FloatArray, signal: FloatArray) -> FloatArray | None:
     """Variance, mean level and mean squared signal (3, bins) of one band's pixels; None if they are too few."""
-    some = np.flatnonzero(good)
-    some = some[:: max(len(some) // _NOISE_SAMPLES, 1)]
-    if len(some) < 12 * _NOISE_BINS:
+    if len(signal) < 12 * _NOISE_BINS:
         return None
-    some = some[: len(some) // _NOISE_BINS * _NOISE_BINS]
-    some = some[np.argsort(signal[some])]
+    some = np.argsort(signal[: len(signal) // _NOISE_BINS * _NOISE_BINS])
     error, level, signal = (x[some].reshape(_NOISE_BINS, -1) for x in (np.abs(residual), level, signal))
     # Medians are deaf to what does not belong; a sixth of the freedom went into the fit.
     middle = error.shape[1] // 2

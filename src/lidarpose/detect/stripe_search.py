@@ -11,6 +11,7 @@ import numpy as np
 
 from lidarpose.detect.albedo import MARGIN, PanelAlbedo
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
+from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.robust import median
 from lidarpose.model.image import GrayImage
 
@@ -18,6 +19,8 @@ from lidarpose.model.image import GrayImage
 _SMALL_SIDE = 180
 # Random places, the same for all images, at which pairs of maxima are drawn.
 _DRAWS = np.random.default_rng(0).random((2, 80))
+# Votes of a column whose maximum is as high as is typical, or higher.
+_VOTE = 256
 # A second line with this share of the first one's support makes the choice between them a guess.
 _AMBIGUOUS = 0.5
 # A stripe, saturated or not, is narrower than twice this many reduced pixels.
@@ -104,8 +107,13 @@ class PanelView:
             slopes,
         )
 
-    def crop(self, image: GrayImage) -> GrayImage:
-        return image[self.low[1] : self.high[1], self.low[0] : self.high[0]]
+    def reduced(self, image: GrayImage) -> FloatArray:
+        """The panel's part of an image, reduced (float32)."""
+        if self.factor > 1 and image.dtype == np.uint8 and pays(0.0):
+            from lidarpose.detect import stripe_kernels
+
+            return np.asarray(stripe_kernels.block_means(image, self.low, self.high, self.factor))
+        return reduce_image(image[self.low[1] : self.high[1], self.low[0] : self.high[0]], self.factor)
 
     def grid_and_slopes(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Grid coordinates (..., 2) at pixels (..., 2), and their derivatives (..., 4) as in `slopes`."""
@@ -221,7 +229,7 @@ class CoarseLine:
 
 def find_line(view: PanelView, image: GrayImage) -> CoarseLine | str:
     """The one line of light on the panel, or why there is none, in words."""
-    small = reduce_image(view.crop(image), view.factor)
+    small = view.reduced(image)
     return _find_in_reduced(view, small, view.small_bright)
 
 
@@ -234,10 +242,10 @@ def has_line(view: PanelView) -> bool:
 
 
 def _find_in_reduced(view: PanelView, small: FloatArray, template: FloatArray, least: float = 1.5) -> CoarseLine | str:
-    rest, share = _without_ambient(view, small, template)
+    share, offset = _ambient(view, small, template)
     if _is_elsewhere(view, small, template):
         return "the board is not where the bright images show it: it or the camera was moved"
-    ridges = (_ridge(rest), _ridge(rest.T))
+    rest, ridges = _rest_and_ridges(view, small, template, share, offset)
     threshold = max(6.0 * _noise(view, ridges), least)
     first = _best_line(ridges, threshold)
     if first is None:
@@ -315,18 +323,35 @@ class _SmallLine:
     level: float
 
 
-def _without_ambient(view: PanelView, small: FloatArray, template: FloatArray) -> tuple[FloatArray, float]:
-    """What the bright image (`template`) does not explain, made flat, zero off the panel; and the ambient share."""
+def _ambient(view: PanelView, small: FloatArray, template: FloatArray) -> tuple[float, float]:
+    """The light of the bright image (`template`) that is in this one too: a share of it, and a level beside."""
     if len(view.light) == 0 or len(view.dark) == 0:
-        return np.zeros_like(small), 0.0
+        return 0.0, 0.0
     light, dark, bright_light, bright_dark = (
         median(field.ravel()[index]) for field in (small, template) for index in (view.light, view.dark)
     )
     share = max((light - dark) / max(bright_light - bright_dark, 1.0), 0.0)
-    rest = np.asarray(small - np.float32(share) * template)
-    rest -= np.float32(dark - share * bright_dark)
-    rest *= view.small_mask
-    return rest, share
+    return share, dark - share * bright_dark
+
+
+def _rest_and_ridges(
+    view: PanelView, small: FloatArray, template: FloatArray, share: float, offset: float
+) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:
+    """What the bright image (`template`) does not explain, zero off the panel; its ridges along x and along y."""
+    if len(view.light) == 0 or len(view.dark) == 0:
+        rest = np.zeros_like(small)
+    elif pays(0.0):
+        from lidarpose.detect import stripe_kernels
+
+        rest, along, across = np.empty_like(small), np.empty_like(small), np.empty(small.shape[::-1], np.float32)
+        parts = (np.float32(share), np.float32(offset), _RIDGE_REACH)
+        stripe_kernels.rest_and_ridges(small, template, view.small_mask, *parts, rest, along, across)
+        return rest, (along, across)
+    else:
+        rest = np.asarray(small - np.float32(share) * template)
+        rest -= np.float32(offset)
+        rest *= view.small_mask
+    return rest, (_ridge(rest), _ridge(rest.T))
 
 
 def _noise(view: PanelView, ridges: tuple[FloatArray, FloatArray]) -> float:
@@ -343,25 +368,44 @@ def _best_line(ridges: tuple[FloatArray, FloatArray], threshold: float) -> tuple
     """Line, its support, and its length in reduced pixels."""
     candidates = []
     for ridge, steep in zip(ridges, (False, True), strict=True):
-        peak = np.argmax(ridge, axis=0)
-        height = ridge[peak, np.arange(ridge.shape[1])]
-        strong = height > threshold
-        if strong.sum() >= 6:
-            x = np.flatnonzero(strong).astype(np.float64)
-            found = _consensus(x, peak[strong].astype(np.float64), height[strong], ridge.shape[0])
-            if found is not None:
-                slope, intercept, inliers, support = found
-                level = median(height[strong][inliers])
-                line = _SmallLine(steep, float(x[inliers].min()), float(x[inliers].max()), slope, intercept, level)
-                candidates.append((line, support, float(inliers.sum())))
+        found = _line_in(ridge, threshold)
+        if found is not None:
+            slope, intercept, start, end, level, support, length = found
+            candidates.append((_SmallLine(steep, start, end, slope, intercept, level), support, length))
     return max(candidates, key=lambda c: c[1]) if candidates else None
 
 
-def _consensus(
-    x: FloatArray, y: FloatArray, height: FloatArray, extent: int
-) -> tuple[float, float, BoolArray, float] | None:
-    """RANSAC for y = intercept + slope x, |slope| <= 1.5, among the maxima; None if chance explains the support."""
-    weight = np.minimum(height, median(height))
+_Line = tuple[float, float, float, float, float, float, float]
+"""Slope, intercept, start, end, level, support, and how many columns or rows support it."""
+
+
+def _line_in(ridge: FloatArray, threshold: float) -> _Line | None:
+    """The line through the columns' maxima above a threshold."""
+    if pays(0.0):
+        from lidarpose.detect import stripe_kernels
+
+        peak, height = np.empty(ridge.shape[1], np.int64), np.empty(ridge.shape[1], np.float32)
+        stripe_kernels.peaks(ridge, peak, height)
+        found = np.empty(7)
+        least = np.asarray(threshold, dtype=np.float32)[()]
+        if not stripe_kernels.consensus(peak, height, least, _DRAWS, len(ridge), _VOTE, found):
+            return None
+        slope, intercept, start, end, level, support, length = found.tolist()
+        return slope, intercept, start, end, level, support, length
+    peak = np.argmax(ridge, axis=0)
+    height = ridge[peak, np.arange(ridge.shape[1])]
+    x = np.flatnonzero(height > threshold)
+    return _consensus(x, peak[x], height[x], len(ridge)) if len(x) >= 6 else None
+
+
+def _consensus(x: IntArray, y: IntArray, height: FloatArray, extent: int) -> _Line | None:
+    """RANSAC for y = intercept + slope x, |slope| <= 1.5, among the maxima; None if chance explains the support.
+
+    A column has at most `_VOTE` votes, by its height. Votes and coordinates are whole numbers: sums of them are the
+    same in any order.
+    """
+    typical = median(height)
+    votes = np.rint(np.minimum(height / np.float32(typical), np.float32(1.0)) * np.float32(_VOTE))
     # Pairs of one from each half: far enough apart to give a direction.
     half = len(x) // 2
     a = (_DRAWS[0] * half).astype(np.intp)
@@ -369,25 +413,38 @@ def _consensus(
     slope = (y[b] - y[a]) / (x[b] - x[a])
     intercept = y[a] - slope * x[a]
     near = np.abs(intercept[:, None] + slope[:, None] * x - y) <= 1.5
-    support = (near @ weight) * (np.abs(slope) <= 1.5)
-    best = int(np.argmax(support))
+    best = int(np.argmax((near @ votes) * (np.abs(slope) <= 1.5)))
     inliers = near[best]
-    s = (x - x[0]) / (x[-1] - x[0])
-    powers = np.stack([np.ones_like(s), s, s * s])
+    t = x - x[0]
+    powers = np.stack([np.ones_like(t), t, t * t, t * t * t, t * t * t * t, y, y * t, y * t * t])
     for _ in range(2):
-        if np.count_nonzero(inliers) < 6:
+        sums = powers[:, inliers].sum(axis=1).tolist()
+        if sums[0] < 6:
             return None
         # A little bend: lenses.
-        used = powers * inliers
-        c = np.linalg.solve(used @ powers.T + 1e-9 * np.eye(3), used @ y)
-        inliers = np.abs(c @ powers - y) <= 1.5
+        c0, c1, c2 = parabola(*sums)
+        inliers = np.abs(c0 + c1 * t + c2 * powers[2] - y) <= 1.5
+    u, v, count = x[inliers], y[inliers], int(np.count_nonzero(inliers))
     by_chance = len(x) * 4.0 / extent
-    if inliers.sum() < max(6.0, 3.0 * by_chance):
+    if count < max(6.0, 3.0 * by_chance):
         return None
-    u, v = x[inliers], y[inliers]
-    centred = u - u.mean()
-    slope_fit = float(centred @ v / (centred @ centred))
-    return slope_fit, float(v.mean() - slope_fit * u.mean()), inliers, float(weight[inliers].sum())
+    su, sv, suu, suv = (int(part) for part in (u.sum(), v.sum(), u @ u, u @ v))
+    direction = (count * suv - su * sv) / (count * suu - su * su)
+    support = float(votes[inliers].sum()) * typical / _VOTE
+    intercept_fit = sv / count - direction * (su / count)
+    return direction, intercept_fit, float(u[0]), float(u[-1]), median(height[inliers]), support, float(count)
+
+
+def parabola(n: int, t1: int, t2: int, t3: int, t4: int, y0: int, y1: int, y2: int) -> tuple[float, float, float]:
+    """Least squares of y = c0 + c1 t + c2 t^2 from sums over whole numbers: of t^0 to t^4, and of y, y t, y t^2."""
+    a, b, c, d, e, p, q, r = float(n), float(t1), float(t2), float(t3), float(t4), float(y0), float(y1), float(y2)
+    # Cramer's rule: [a b c; b c d; c d e] times the coefficients is [p q r].
+    k0, k1, k2 = c * e - d * d, b * e - c * d, b * d - c * c
+    det = a * k0 - b * k1 + c * k2
+    c0 = (p * k0 - q * k1 + r * k2) / det
+    c1 = (-p * k1 + q * (a * e - c * c) - r * (a * d - b * c)) / det
+    c2 = (p * k2 - q * (a * d - b * c) + r * (a * c - b * b)) / det
+    return c0, c1, c2
 
 
 def _erase(ridge: FloatArray, line: _SmallLine, steep: bool) -> None:
@@ -396,6 +453,11 @@ def _erase(ridge: FloatArray, line: _SmallLine, steep: bool) -> None:
     field = ridge if steep == line.steep else ridge.T
     x = np.arange(field.shape[1])
     middle = np.rint(line.intercept + line.slope * x).astype(np.intp)
+    if pays(0.0):
+        from lidarpose.detect import stripe_kernels
+
+        stripe_kernels.erase(field, middle, reach)
+        return
     y = np.clip(middle + np.arange(-reach, reach + 1)[:, None], 0, field.shape[0] - 1)
     field[y, x] = 0.0
 

@@ -1,0 +1,463 @@
+"""The passes over pixels of `stripe_search`, `stripe_bands` and `stripe_fit`, compiled by numba; imported only where
+they pay.
+
+Each gives the very bits that the NumPy way gives: the same operations in the same precision and order (a sum over a
+profile's pixels runs from the first to the last in both), while exponentials are left to NumPy. So it does not matter
+to the result which way was taken, and every decision on the way falls alike.
+
+Tables are (P, B, N) as in `stripe_bands`. They are gone through in pieces of `_PIECE` profiles, which are copied to one
+small array first: the compiler then sees that nothing overlaps and works on several profiles at once, and what is
+summed stays in the fastest memory.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lidarpose.detect.stripe_search import parabola
+from lidarpose.geometry.compiled import kernel
+
+_PIECE = 128
+
+
+@kernel
+def _copy(source: Any, target: Any, count: int) -> None:
+    for i in range(count):
+        target[i] = source[i]
+
+
+@kernel
+def exponents(v: Any, centre: Any, cosine: Any, by_width: Any, found: Any) -> None:
+    """-d^2 / 2 (P, B, N) of the pixels' distances d in widths; `by_width` (B,) is 1 / width."""
+    profile_pixels, bands, profiles = v.shape
+    half = np.float32(-0.5)
+    for p in range(profile_pixels):
+        for b in range(bands):
+            at, middle, tilt, out, scale = v[p, b], centre[b], cosine[b], found[p, b], by_width[b]
+            for n in range(profiles):
+                d = (at[n] - middle[n]) * tilt[n] * scale
+                out[n] = half * (d * d)
+
+
+@kernel
+def normal_equations(
+    v: Any,
+    values: Any,
+    ambient: Any,
+    good: Any,
+    light: Any,
+    bell: Any,
+    centre: Any,
+    cosine: Any,
+    slant: Any,
+    height: Any,
+    background: Any,
+    each: Any,
+    rows: Any,
+) -> None:
+    """The sums of `stripe_fit._normal_equations` (14, B, N), one row after the other.
+
+    `slant` (B, N) is cosine over width; `each` (B, 6) has 1 / width, light from dark squares, 1 less that, and the
+    noise's three numbers.
+    """
+    profile_pixels, bands, profiles = v.shape
+    zero, size = np.float32(0.0), _PIECE
+    s = np.zeros(25 * _PIECE, np.float32)
+    at, value, around = s[:size], s[size : 2 * size], s[2 * size : 3 * size]
+    counts, share, peak = s[3 * size : 4 * size], s[4 * size : 5 * size], s[5 * size : 6 * size]
+    middle, tilt, slope = s[6 * size : 7 * size], s[7 * size : 8 * size], s[8 * size : 9 * size]
+    high, base = s[9 * size : 10 * size], s[10 * size : 11 * size]
+    s00, s01, s02 = s[11 * size : 12 * size], s[12 * size : 13 * size], s[13 * size : 14 * size]
+    s03, s04, s11 = s[14 * size : 15 * size], s[15 * size : 16 * size], s[16 * size : 17 * size]
+    s12, s13, s14 = s[17 * size : 18 * size], s[18 * size : 19 * size], s[19 * size : 20 * size]
+    s22, s23, s24 = s[20 * size : 21 * size], s[21 * size : 22 * size], s[22 * size : 23 * size]
+    s33, s34 = s[23 * size : 24 * size], s[24 * size : 25 * size]
+    for b in range(bands):
+        scale, dark, rest, reading, shots, speckle = each[b]
+        for first in range(0, profiles, size):
+            last = min(first + size, profiles)
+            count = last - first
+            _copy(centre[b, first:last], middle, count)
+            _copy(cosine[b, first:last], tilt, count)
+            _copy(slant[b, first:last], slope, count)
+            _copy(height[b, first:last], high, count)
+            _copy(background[b, first:last], base, count)
+            for i in range(11 * size, 25 * size):
+                s[i] = zero
+            for p in range(profile_pixels):
+                _copy(v[p, b, first:last], at, count)
+                _copy(values[p, b, first:last], value, count)
+                _copy(ambient[p, b, first:last], around, count)
+                _copy(good[p, b, first:last], counts, count)
+                _copy(light[p, b, first:last], share, count)
+                _copy(bell[p, b, first:last], peak, count)
+                for i in range(size):
+                    d = (at[i] - middle[i]) * tilt[i] * scale
+                    by_height = peak[i] * (dark + rest * share[i])
+                    signal = high[i] * by_height
+                    residual = value[i] - base[i] - signal
+                    level = value[i] + around[i]
+                    level = level if level > zero else zero
+                    weight = counts[i] / (reading + shots * level + speckle * signal * signal)
+                    by_centre, by_width = signal * d * slope[i], signal * (d * d)
+                    w1, w2, w3 = by_height * weight, by_centre * weight, by_width * weight
+                    s00[i] += weight
+                    s01[i] += weight * by_height
+                    s02[i] += weight * by_centre
+                    s03[i] += weight * by_width
+                    s04[i] += weight * residual
+                    s11[i] += w1 * by_height
+                    s12[i] += w1 * by_centre
+                    s13[i] += w1 * by_width
+                    s14[i] += w1 * residual
+                    s22[i] += w2 * by_centre
+                    s23[i] += w2 * by_width
+                    s24[i] += w2 * residual
+                    s33[i] += w3 * by_width
+                    s34[i] += w3 * residual
+            for k in range(14):
+                _copy(s[(11 + k) * size : (12 + k) * size], rows[k, b, first:last], count)
+
+
+@kernel
+def start_sums(values: Any, good: Any, light: Any, bell: Any, each: Any, sums: Any) -> None:
+    """The sums (5, B, N) of `stripe_fit._start`; `each` (B, 2) has the light from dark squares, and 1 less that."""
+    profile_pixels, bands, profiles = values.shape
+    zero, size = np.float32(0.0), _PIECE
+    s = np.zeros(9 * _PIECE, np.float32)
+    value, counts = s[:size], s[size : 2 * size]
+    share, peak = s[2 * size : 3 * size], s[3 * size : 4 * size]
+    n, b1, v1 = s[4 * size : 5 * size], s[5 * size : 6 * size], s[6 * size : 7 * size]
+    bb, bv = s[7 * size : 8 * size], s[8 * size : 9 * size]
+    for b in range(bands):
+        dark, rest = each[b]
+        for first in range(0, profiles, size):
+            last = min(first + size, profiles)
+            count = last - first
+            for i in range(4 * size, 9 * size):
+                s[i] = zero
+            for p in range(profile_pixels):
+                _copy(values[p, b, first:last], value, count)
+                _copy(good[p, b, first:last], counts, count)
+                _copy(light[p, b, first:last], share, count)
+                _copy(bell[p, b, first:last], peak, count)
+                for i in range(size):
+                    top = peak[i] * (dark + rest * share[i])
+                    weighted = counts[i] * top
+                    n[i] += counts[i]
+                    b1[i] += weighted
+                    v1[i] += counts[i] * value[i]
+                    bb[i] += weighted * top
+                    bv[i] += weighted * value[i]
+            for k in range(5):
+                _copy(s[(4 + k) * size : (5 + k) * size], sums[k, b, first:last], count)
+
+
+@kernel
+def ambient_products(
+    v: Any, values: Any, bright: Any, good: Any, centre: Any, cosine: Any, beyond: Any, own: Any, cross: Any
+) -> None:
+    """Sums (B, N) of bright * bright and bright * values over the pixels further than `beyond` (B,) from the centre,
+    both less their means there."""
+    profile_pixels, bands, profiles = v.shape
+    zero, one, size = np.float32(0.0), np.float32(1.0), _PIECE
+    s = np.zeros(11 * _PIECE, np.float32)
+    at, value, board = s[:size], s[size : 2 * size], s[2 * size : 3 * size]
+    counts, middle, tilt = s[3 * size : 4 * size], s[4 * size : 5 * size], s[5 * size : 6 * size]
+    n, of_value, of_board = s[6 * size : 7 * size], s[7 * size : 8 * size], s[8 * size : 9 * size]
+    mine, mixed = s[9 * size : 10 * size], s[10 * size : 11 * size]
+    for b in range(bands):
+        for first in range(0, profiles, size):
+            last = min(first + size, profiles)
+            count = last - first
+            _copy(centre[b, first:last], middle, count)
+            _copy(cosine[b, first:last], tilt, count)
+            for i in range(6 * size, 11 * size):
+                s[i] = zero
+            for means in (True, False):
+                for p in range(profile_pixels):
+                    _copy(v[p, b, first:last], at, count)
+                    _copy(values[p, b, first:last], value, count)
+                    _copy(bright[p, b, first:last], board, count)
+                    _copy(good[p, b, first:last], counts, count)
+                    if means:
+                        for i in range(size):
+                            d = (at[i] - middle[i]) * tilt[i]
+                            flank = counts[i] * (one if abs(d) > beyond[b] else zero)
+                            n[i] += flank
+                            of_value[i] += value[i] * flank
+                            of_board[i] += board[i] * flank
+                    else:
+                        for i in range(size):
+                            d = (at[i] - middle[i]) * tilt[i]
+                            flank = counts[i] * (one if abs(d) > beyond[b] else zero)
+                            x, y = flank * (board[i] - of_board[i]), flank * (value[i] - of_value[i])
+                            mine[i] += x * x
+                            mixed[i] += x * y
+                if means:
+                    for i in range(size):
+                        total = n[i] if n[i] > one else one
+                        of_value[i] = of_value[i] / total
+                        of_board[i] = of_board[i] / total
+            _copy(mine, own[b, first:last], count)
+            _copy(mixed, cross[b, first:last], count)
+
+
+@kernel
+def _looked_up(table: Any, index: Any) -> Any:
+    """The table's entry at an index that is kept within it and cut to a whole number."""
+    last = np.float32(len(table) - 1)
+    kept = index if index > np.float32(0.0) else np.float32(0.0)
+    kept = kept if kept < last else last
+    return table[np.uint64(np.int32(kept))]
+
+
+@kernel
+def _wave(x: Any, scale: Any, low: Any, high: Any, table: Any) -> Any:
+    """`albedo.soft_square_wave` at x, kept between `low` and `high`."""
+    one, two, half = np.float32(1.0), np.float32(2.0), np.float32(0.5)
+    kept = x if x > low else low
+    kept = kept if kept < high else high
+    turn = half * kept + np.float32(0.25)
+    distance = half - abs(two * (turn - np.floor(turn)) - one)
+    return _looked_up(table, distance * scale + np.float32(len(table) // 2 + 0.5))
+
+
+@kernel
+def light_shares(
+    v: Any,
+    centre: Any,
+    grid: Any,
+    per_v: Any,
+    scales: Any,
+    size: Any,
+    near: Any,
+    first_is_dark: bool,
+    table: Any,
+    found: Any,
+) -> None:
+    """`PanelAlbedo.light_share` (P, B, N) at pixels; `grid`, `per_v`, `scales` are (2, B, N), for x and y.
+
+    `size` (2,) is how many corners, `near` (2, 2) whether the board's lower and upper end are near; `table` is of the
+    error function.
+    """
+    profile_pixels, bands, profiles = v.shape
+    one, half = np.float32(1.0), np.float32(0.5)
+    sign = -half if first_is_dark else half
+    middle = np.float32(len(table) // 2 + 0.5)
+    low, high_x, high_y = np.float32(-0.5), size[0] - half, size[1] - half
+    for p in range(profile_pixels):
+        for b in range(bands):
+            for n in range(profiles):
+                dv = v[p, b, n] - centre[b, n]
+                x, y = dv * per_v[0, b, n] + grid[0, b, n], dv * per_v[1, b, n] + grid[1, b, n]
+                scale_x, scale_y = scales[0, b, n], scales[1, b, n]
+                wave = _wave(x, scale_x, low, high_x, table) * _wave(y, scale_y, low, high_y, table)
+                share = half + sign * wave
+                if near[0, 0]:
+                    step = half + half * _looked_up(table, (x + one) * scale_x + middle)
+                    share = one - (one - share) * step
+                if near[0, 1]:
+                    step = half + half * _looked_up(table, (size[0] - x) * scale_x + middle)
+                    share = one - (one - share) * step
+                if near[1, 0]:
+                    step = half + half * _looked_up(table, (y + one) * scale_y + middle)
+                    share = one - (one - share) * step
+                if near[1, 1]:
+                    step = half + half * _looked_up(table, (size[1] - y) * scale_y + middle)
+                    share = one - (one - share) * step
+                found[p, b, n] = share
+
+
+@kernel
+def cut_band(
+    image: Any,
+    bright: Any,
+    steep: bool,
+    low: Any,
+    high: Any,
+    limit: float,
+    band: int,
+    u: Any,
+    centre: Any,
+    valid: Any,
+    half: int,
+    reach: int,
+    v: Any,
+    values: Any,
+    levels: Any,
+    good: Any,
+) -> None:
+    """One band of `stripe_bands.cut`, into the tables' [:, band]; `low` and `high` are of the panel in the image."""
+    across = 0 if steep else 1
+    for k in range(2 * reach + 1):
+        within = abs(k - reach) <= half
+        for n in range(u.shape[1]):
+            at = np.int64(np.rint(centre[band, n])) + k - reach
+            safe = min(max(at, low[across]), high[across] - 1)
+            along = np.int64(u[band, n])
+            row, column = (along, safe) if steep else (safe, along)
+            value = image[np.uint64(row), np.uint64(column)]
+            v[k, band, n] = at
+            values[k, band, n] = value
+            levels[k, band, n] = bright[np.uint64(row - low[1]), np.uint64(column - low[0])]
+            counts = at == safe and value < limit and within and valid[band, n]
+            good[k, band, n] = np.float32(1.0) if counts else np.float32(0.0)
+
+
+@kernel
+def block_means(image: Any, low: Any, high: Any, factor: int) -> Any:
+    """`stripe_search.reduce_image` of the part of an 8-bit image from `low` up to `high`, by 2, 3 or 4."""
+    height, width = (high[1] - low[1]) // factor, (high[0] - low[0]) // factor
+    share = np.float32(1.0 / factor**2)
+    found = np.empty((height, width), np.float32)
+    sums = np.empty(width * factor, np.uint16)
+    for i in range(height):
+        top, left, right = low[1] + i * factor, low[0], low[0] + width * factor
+        a, b = image[top, left:right], image[top + 1, left:right]
+        # Four rows at once whatever the factor, so that one loop does all; those not needed count nothing.
+        c, d = image[top + min(2, factor - 1), left:right], image[top + factor - 1, left:right]
+        third, fourth = np.uint16(factor > 2), np.uint16(factor > 3)
+        for j in range(width * factor):
+            sums[j] = np.uint16(a[j]) + np.uint16(b[j]) + np.uint16(c[j]) * third + np.uint16(d[j]) * fourth
+        row = found[i]
+        if factor == 4:
+            for j in range(width):
+                row[j] = np.float32(np.int32(sums[4 * j] + sums[4 * j + 1] + sums[4 * j + 2] + sums[4 * j + 3])) * share
+        else:
+            for j in range(width):
+                total = np.int32(0)
+                for k in range(factor):
+                    total += sums[j * factor + k]
+                row[j] = np.float32(total) * share
+    return found
+
+
+@kernel
+def rest_and_ridges(
+    small: Any, template: Any, mask: Any, share: Any, offset: Any, reach: int, rest: Any, along: Any, across: Any
+) -> None:
+    """As `stripe_search._rest_and_ridges`: the ridges are of `rest` (`along`, (H, W)) and its transpose (`across`)."""
+    height, width = small.shape
+    for i in range(height):
+        for j in range(width):
+            rest[i, j] = (small[i, j] - share * template[i, j] - offset) * np.float32(mask[i, j])
+    along[:] = np.float32(0.0)
+    across[:] = np.float32(0.0)
+    for i in range(reach, height - reach):
+        for j in range(width):
+            above, below = rest[i, j] - rest[i - reach, j], rest[i, j] - rest[i + reach, j]
+            along[i, j] = above if above < below else below
+    for i in range(height):
+        for j in range(reach, width - reach):
+            before, after = rest[i, j] - rest[i, j - reach], rest[i, j] - rest[i, j + reach]
+            across[j, i] = before if before < after else after
+
+
+@kernel
+def peaks(ridge: Any, peak: Any, height: Any) -> None:
+    """Where each column of a ridge image (H, W) is highest, the first of equal places, and how high."""
+    _copy(ridge[0], height, len(height))
+    for j in range(len(peak)):
+        peak[j] = 0
+    for i in range(1, len(ridge)):
+        row = ridge[i]
+        for j in range(len(peak)):
+            if row[j] > height[j]:
+                height[j] = row[j]
+                peak[j] = i
+
+
+_parabola = kernel(parabola)
+
+
+@kernel
+def _median(values: Any, order: Any) -> float:
+    """As `geometry.robust.median`, of values in single precision; `order` is room for as many."""
+    _copy(values, order, len(values))
+    ordered = np.sort(order[: len(values)])
+    return 0.5 * np.float64(ordered[(len(values) - 1) // 2] + ordered[len(values) // 2])
+
+
+@kernel
+def _best_draw(x: Any, y: Any, votes: Any, draws: Any) -> tuple[float, float]:
+    """Slope and intercept of the drawn line that has most votes near it, the first of equals."""
+    half = len(x) // 2
+    best, level, most = 0.0, 0.0, np.float32(-1.0)
+    for k in range(draws.shape[1]):
+        a = np.int64(draws[0, k] * half)
+        b = half + np.int64(draws[1, k] * (len(x) - half))
+        slope = (y[b] - y[a]) / (x[b] - x[a])
+        intercept = y[a] - slope * x[a]
+        total = np.float32(0.0)
+        if abs(slope) <= 1.5:
+            for i in range(len(x)):
+                near = abs(intercept + slope * x[i] - y[i]) <= 1.5
+                total += votes[i] if near else np.float32(0.0)
+        if total > most:
+            best, level, most = slope, intercept, total
+    return best, level
+
+
+@kernel
+def consensus(peak: Any, height: Any, threshold: Any, draws: Any, extent: int, unit: int, found: Any) -> bool:
+    """`stripe_search._consensus`; writes slope, intercept, start, end, level, support and count to `found` (7,)."""
+    n = 0
+    x, y = np.empty(len(peak), np.int64), np.empty(len(peak), np.int64)
+    high, room = np.empty(len(peak), np.float32), np.empty(len(peak), np.float32)
+    for j in range(len(peak)):
+        if height[j] > threshold:
+            x[n], y[n], high[n] = j, peak[j], height[j]
+            n += 1
+    if n < 6:
+        return False
+    x, y, high = x[:n], y[:n], high[:n]
+    typical = _median(high, room)
+    votes, near = np.empty(n, np.float32), np.empty(n, np.bool_)
+    for i in range(n):
+        share = high[i] / np.float32(typical)
+        votes[i] = np.rint((share if share < np.float32(1.0) else np.float32(1.0)) * np.float32(unit))
+    slope, intercept = _best_draw(x, y, votes, draws)
+    for i in range(n):
+        near[i] = abs(intercept + slope * x[i] - y[i]) <= 1.5
+    for _ in range(2):
+        n0, t1, t2, t3, t4, y0, y1, y2 = 0, 0, 0, 0, 0, 0, 0, 0
+        for i in range(n):
+            if near[i]:
+                t = x[i] - x[0]
+                n0, t1, t2, t3, t4 = n0 + 1, t1 + t, t2 + t * t, t3 + t * t * t, t4 + t * t * t * t
+                y0, y1, y2 = y0 + y[i], y1 + y[i] * t, y2 + y[i] * t * t
+        if n0 < 6:
+            return False
+        c0, c1, c2 = _parabola(n0, t1, t2, t3, t4, y0, y1, y2)
+        for i in range(n):
+            t = x[i] - x[0]
+            near[i] = abs(c0 + c1 * t + c2 * (t * t) - y[i]) <= 1.5
+    count = np.count_nonzero(near)
+    by_chance = n * 4.0 / extent
+    if count < max(6.0, 3.0 * by_chance):
+        return False
+    total, su, sv, suu, suv, m = np.float32(0.0), 0, 0, 0, 0, 0
+    for i in range(n):
+        if near[i]:
+            total += votes[i]
+            su, sv, suu, suv = su + x[i], sv + y[i], suu + x[i] * x[i], suv + x[i] * y[i]
+            x[m], high[m] = x[i], high[i]
+            m += 1
+    slope = (count * suv - su * sv) / (count * suu - su * su)
+    found[0], found[1] = slope, sv / count - slope * (su / count)
+    found[2], found[3] = x[0], x[m - 1]
+    found[4] = _median(high[:m], room)
+    found[5], found[6] = np.float64(total) * typical / unit, count
+    return True
+
+
+@kernel
+def erase(field: Any, middle: Any, reach: int) -> None:
+    """Zeros in each column of a ridge image, up to `reach` from `middle`, as far as the image goes."""
+    last = len(field) - 1
+    for j in range(len(middle)):
+        for i in range(min(max(middle[j] - reach, 0), last), min(max(middle[j] + reach, 0), last) + 1):
+            field[i, j] = np.float32(0.0)

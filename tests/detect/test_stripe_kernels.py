@@ -1,0 +1,92 @@
+"""Stripes found by compiled kernels: the very bits that NumPy finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lidarpose.detect.chessboard import find_panels
+from lidarpose.detect.laser_stripe import StripeDetection, StripeFinder
+from lidarpose.detect.stripe_search import parabola, reduce_image
+from lidarpose.geometry import compiled
+
+pytestmark = pytest.mark.skipif(not compiled.installed(), reason="numba is not installed")
+
+AZIMUTHS_DEG = (90.0, 75.0, 130.0, 5.0)
+
+
+@pytest.fixture(scope="module")
+def shots(two_panels):
+    rng = np.random.default_rng(21)
+    return [two_panels.noisy(two_panels.bright(), rng) for _ in range(2)]
+
+
+@pytest.fixture(scope="module")
+def images(two_panels):
+    """Stripes along rows and columns, faint and saturated, with and without other light; a glare, and nothing."""
+    rng = np.random.default_rng(22)
+    found = [np.zeros((two_panels.height, two_panels.width), np.uint8)]
+    for k, azimuth_deg in enumerate(AZIMUTHS_DEG):
+        a = np.radians(azimuth_deg)
+        normal = np.array([np.cos(a), np.sin(a), 0.1])
+        normal /= np.linalg.norm(normal)
+        offset = float(normal @ [-0.09 if azimuth_deg < 45.0 else 0.0, 0.013, 1.0])
+        for level in (40.0, 1500.0):
+            clean = two_panels.stripe(normal, offset, 0.0011, level) + 0.1 * k * two_panels.bright()
+            found.append(two_panels.noisy(clean, rng))
+    v, u = np.indices((two_panels.height, two_panels.width))
+    glare = 900.0 * np.exp(-0.5 * (((u - 420) / 60.0) ** 2 + ((v - 190) / 9.0) ** 2))
+    found.append(two_panels.noisy(clean + glare, rng))
+    return found
+
+
+def found_in(way: bool, two_panels, shots, images) -> list[StripeDetection]:
+    with compiled.forced(way):
+        finder = StripeFinder(find_panels(shots, [board.panel for board in two_panels.boards]), shots)
+        return finder.find_in(images)
+
+
+def test_both_ways_find_the_same_bits(two_panels, shots, images) -> None:
+    ours, theirs = (found_in(way, two_panels, shots, images) for way in (True, False))
+    stripes = 0
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.problems == other.problems
+        assert one.stripes.keys() == other.stripes.keys()
+        for k, points in one.stripes.items():
+            stripes += 1
+            for part in ("pixels", "normals", "sigma_px"):
+                np.testing.assert_array_equal(getattr(points, part), getattr(other.stripes[k], part))
+    assert stripes >= 10
+
+
+def test_sixteen_bits_too(two_panels, shots, images) -> None:
+    wide = [np.asarray(image, np.uint16) * np.uint16(200) for image in images[:6]]
+    bright = [np.asarray(shot, np.uint16) * np.uint16(200) for shot in shots]
+    ours, theirs = (found_in(way, two_panels, bright, wide) for way in (True, False))
+    assert sum(len(found.stripes) for found in ours) > 5
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.problems == other.problems
+        for k, points in one.stripes.items():
+            np.testing.assert_array_equal(points.pixels, other.stripes[k].pixels)
+            np.testing.assert_array_equal(points.sigma_px, other.stripes[k].sigma_px)
+
+
+@pytest.mark.parametrize("factor", [2, 3, 4])
+def test_means_of_blocks(factor: int) -> None:
+    from lidarpose.detect.stripe_kernels import block_means
+
+    image = np.random.default_rng(factor).integers(0, 256, (97, 131), dtype=np.uint8)
+    low, high = (5, 3), (5 + 9 * factor, 3 + 7 * factor)
+    part = image[low[1] : high[1], low[0] : high[0]]
+    np.testing.assert_array_equal(block_means(image, low, high, factor), reduce_image(part, factor))
+    np.testing.assert_allclose(
+        reduce_image(part, factor), part.reshape(7, factor, 9, factor).mean(axis=(1, 3)), rtol=1e-6
+    )
+
+
+def test_a_parabola_is_the_least_squares_fit() -> None:
+    rng = np.random.default_rng(3)
+    t = np.sort(rng.choice(300, 60, replace=False))
+    y = np.rint(40.0 + 0.3 * t - 1e-3 * t**2 + rng.normal(size=60)).astype(int)
+    sums = [int((t**k).sum()) for k in range(5)] + [int((y * t**k).sum()) for k in range(3)]
+    np.testing.assert_allclose(parabola(*sums), np.polynomial.polynomial.polyfit(t, y, 2), rtol=1e-6)
