@@ -127,6 +127,7 @@ METRICS: tuple[Metric, ...] = (
         "higher",
         _PLANES,
     ),
+    Metric("planes.open3d_first", "the same, over a process's first clouds, without kernels", "x", 0.4, None, "higher"),
     Metric("planes.open3d_1000", "the same with 1000 iterations, over ours", "x", 0.4, None, "higher"),
     Metric("planes.subsample", "Open3D on a random subsample of 20 k, over ours", "x", 0.4, 5.0, "higher", _PLANES),
     Metric("planes.pyransac3d", "pyransac3d at its defaults, 700 k points, over ours", "x", 0.4, None, "higher"),
@@ -145,6 +146,8 @@ METRICS: tuple[Metric, ...] = (
     Metric("files.laz_read", "LAZ read, over laspy's own", "x", 0.3),
     # The world
     Metric("world.reading", "`calibrate` of 120 HDL-32 frames, over reading them", "x", 0.3, 2.0, bound=_FRAMES),
+    Metric("world.kernels", "the same in a process that runs on and has loaded its kernels", "x", 0.3),
+    Metric("world.open3d_reading", "`calibrate` of them, over Open3D's reading of the same files", "x", 0.4),
     # Growth
     _exponent("growth.places_s", "exponent of calibrate's processor time over places"),
     _exponent("growth.places_mb", "exponent of its memory over places"),

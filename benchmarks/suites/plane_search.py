@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.first_calls import first_call, in_words
 from benchmarks.peers.cloud_planes import open3d_planes, open3d_planes_of_subsample, pyransac3d_planes
 from benchmarks.report import Cell, Effort, Report, Table
 from benchmarks.timing import beside
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.geometry.arrays import FloatArray, angle_between, unit
+from lidarpose.geometry.compiled import forced, installed
 
 NOISE_M = 0.005
 CLUTTER = 0.3
@@ -43,8 +45,16 @@ def scene(n: int, small_share: float | None, seed: int) -> tuple[FloatArray, Flo
 
 
 def ours(points: FloatArray) -> FloatArray:
-    """Normals (K, 3) of the three patches that lidarpose finds first."""
+    """Normals (K, 3) of the three patches that lidarpose finds first, by kernels where it takes them by itself."""
     return np.array([p.plane.normal for p in segment_planes(points, PlaneSearch(max_planes=3))]).reshape(-1, 3)
+
+
+def _forced(way: bool) -> Callable[[FloatArray], FloatArray]:
+    def search(points: FloatArray) -> FloatArray:
+        with forced(way):
+            return ours(points)
+
+    return search
 
 
 def errors_deg(found: FloatArray, truths: FloatArray) -> FloatArray:
@@ -59,7 +69,8 @@ def ways(n: int, quick: bool) -> dict[str, Callable[[FloatArray], FloatArray] | 
     """The contestants at n points; None for one that is not installed."""
     slow = n > 1_000_000
     found: dict[str, Any] = {
-        OURS: ours,
+        OURS: _forced(installed()),
+        BY_NUMPY: _forced(False) if installed() else None,
         OPEN3D: open3d_planes(100),
         SUBSAMPLE: open3d_planes_of_subsample(20_000, 1000),
     }
@@ -71,6 +82,7 @@ def ways(n: int, quick: bool) -> dict[str, Callable[[FloatArray], FloatArray] | 
 
 
 OURS = "lidarpose"
+BY_NUMPY = "lidarpose, a process's first clouds (no kernels)"
 OPEN3D = "Open3D, 100 iterations (its default)"
 OPEN3D_1000 = "Open3D, 1000 iterations (its tutorial)"
 SUBSAMPLE = "Open3D on a random 20 k, 1000 iterations"
@@ -92,7 +104,12 @@ def run(effort: Effort) -> Report:
                 figures |= _figures(small, over, errors)
         name = "three like faces" if small is None else f"one face with {100 * small:.0f} % of the points"
         columns = ["points", "contestant", "s", "over ours", "normals, deg RMS", "worst face, deg", "faces found"]
-        tables.append(Table(f"Planes of a cloud: {name}", columns, rows, _TEXT if small is None else ""))
+        about = ""
+        if small is None:
+            prepare = f"from benchmarks.suites.plane_search import ours, scene\npoints = scene({asked}, None, 1)[0]"
+            first = first_call(prepare, "ours(points)", effort.pick(3, 1))
+            about = f"{_TEXT} {in_words(first, 'clouds are searched by NumPy')}"
+        tables.append(Table(f"Planes of a cloud: {name}", columns, rows, about))
     return Report(figures, tables)
 
 
@@ -145,7 +162,7 @@ def _figures(
     small: float | None, over: dict[str, float | None], errors: dict[str, FloatArray | None]
 ) -> dict[str, float]:
     """The metrics of the size that the targets are about."""
-    peers = {name: e for name, e in errors.items() if name != OURS and e is not None}
+    peers = {name: e for name, e in errors.items() if name not in (OURS, BY_NUMPY) and e is not None}
     mine = errors[OURS]
     if mine is None or not peers:
         return {}
@@ -159,4 +176,7 @@ def _figures(
         ratio = over.get(name)
         if ratio is not None:
             found[key] = ratio
+    open3d, numpy = over.get(OPEN3D), over.get(BY_NUMPY)
+    if open3d is not None and numpy is not None:
+        found["planes.open3d_first"] = open3d / numpy
     return found
