@@ -13,7 +13,7 @@ import pytest
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.spun_scan import MountingRun
-from lidarpose.refine.mounting import MountingOptions
+from lidarpose.refine.mounting_verdict import MountingOptions
 from lidarpose.storage.clouds import read_cloud
 from lidarpose.workflows.self_calibration import axis_in_fan, calibrate_by_flatness, recording_of_cloud
 

@@ -13,7 +13,8 @@ from lidarpose.geometry.planes import Plane
 from lidarpose.geometry.se3 import Pose, exp_so3, log_so3
 from lidarpose.model.spun_scan import FlatReturns
 from lidarpose.refine.flatness import N_ALL, SpunState, linearise
-from lidarpose.refine.mounting import MountingOptions, mounting_calibration, refine_mounting
+from lidarpose.refine.mounting import mounting_calibration, refine_mounting
+from lidarpose.refine.mounting_verdict import MountingOptions
 
 # Of a room without a single right angle.
 WALLS = [(0.99, 0.05, 0.1, 3.0), (0.1, 0.98, 0.05, 2.2), (-0.95, 0.2, 0.0, 2.6), (0.1, -0.99, 0.2, 1.9)]

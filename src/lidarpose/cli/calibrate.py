@@ -43,7 +43,7 @@ def calibrate(
     estimate_scale: Annotated[bool, Parameter(negative=(), show_default=False, group="Corner sessions")] = False,
     axis_beam_deg: Annotated[FiniteFloat | None, Parameter(group="Sweep recordings")] = None,
     start: Annotated[Path | None, Parameter(group="Sweep recordings")] = None,
-    never_stops: Annotated[bool, Parameter(negative=(), show_default=False, group="Sweep recordings")] = False,
+    never_stops: Annotated[bool | None, Parameter(negative="--stops", group="Sweep recordings")] = None,
     want_mm: PositiveFloat | None = None,
     want_deg: PositiveFloat | None = None,
     report: Annotated[bool, Parameter(negative="--no-report", show_default=False)] = True,
@@ -85,7 +85,9 @@ def calibrate(
     start
         A calibration that is right to some degrees and centimetres: how any other rig is mounted.
     never_stops
-        The turntable turned on during the sweeps: interpolate its readings by time_s.npy. Scan with it, too.
+        The turntable turned on during the sweeps: interpolate its readings by time_s.npy. Scan with it, too. --stops:
+        it stood still during each. With neither it is taken to stop, and what it would change if it did not is in the
+        standard deviations where the scene leaves that open.
     want_mm
         Standard deviation of the LiDAR's centre that is good enough, in mm.
     want_deg
@@ -113,7 +115,7 @@ def calibrate(
             quiet=quiet,
         )
         return
-    if axis_beam_deg is not None or start is not None or never_stops:
+    if axis_beam_deg is not None or start is not None or never_stops is not None:
         option = "--axis-beam-deg" if axis_beam_deg is not None else "--start" if start is not None else "--never-stops"
         raise InputError(option, "is for sweep recordings", expected="a folder with recording.toml")
     found = session_format(session)
@@ -158,7 +160,7 @@ def _calibrate_recording(
     want_mm: float | None,
     want_deg: float | None,
     *,
-    never_stops: bool,
+    never_stops: bool | None,
     json: bool,
     quiet: bool,
 ) -> None:

@@ -34,7 +34,7 @@ def calibrate_recording(
     *,
     axis_beam_deg: float | None,
     start: Path | None,
-    never_stops: bool = False,
+    never_stops: bool | None = None,
     estimate: tuple[str, ...] = (),
     want_mm: float | None = None,
     want_deg: float | None = None,
@@ -49,7 +49,7 @@ def calibrate_recording(
         One of the two: the beam angle that points along the turntable's axis, or a calibration file that is roughly
         right.
     never_stops
-        Readings are interpolated by the sweeps' times.
+        Readings are interpolated by the sweeps' times; False says that the table stops for each sweep, None nothing.
     estimate
         Extra parameters by their names on the command line.
 
@@ -61,7 +61,7 @@ def calibrate_recording(
         If the scene does not tell the mounting.
     """
     from lidarpose.cli.console import out, print_json, progress
-    from lidarpose.refine.mounting import MountingOptions
+    from lidarpose.refine.mounting_verdict import MountingOptions
     from lidarpose.storage.calibration import write_calibration
     from lidarpose.storage.provenance import provenance
     from lidarpose.storage.recording import read_recording, recording_files
@@ -70,7 +70,12 @@ def calibrate_recording(
 
     T_table_lidar = _start(axis_beam_deg, start)
     wishes = {k: v for k, v in (("want_mm", want_mm), ("want_deg", want_deg)) if v is not None}
-    options = MountingOptions(tuple(_parameter(name) for name in estimate), **wishes)
+    options = MountingOptions(
+        tuple(_parameter(name) for name in estimate),
+        want_mm if want_mm is not None else MountingOptions.want_mm,
+        want_deg if want_deg is not None else MountingOptions.want_deg,
+        sweeps_stated=never_stops is not None,
+    )
     recording = read_recording(folder)
     if never_stops and not recording.has_reading_per_beam:
         recording = with_readings_between(recording)

@@ -22,6 +22,9 @@ class FlatReturns:
         The turntable's reading, the beam's angle, the range.
     sweep, surface : (n,)
         Which sweep a return is of, and which surface it lies on.
+    left_out_rad : (n,) or None
+        By how much further the table would be turned at the return if it moved during sweeps the other way than the
+        readings have it: on and on where they are of whole sweeps, not at all where each beam has its own.
     """
 
     reading_rad: FloatArray
@@ -29,6 +32,7 @@ class FlatReturns:
     range_m: FloatArray
     sweep: IntArray
     surface: IntArray
+    left_out_rad: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.range_m)
@@ -95,6 +99,8 @@ class MountingEstimate:
     parameter_names, covariance
         "rx_rad", "ry_rad" (left rotation of T_table_lidar, its translation held), "x_m", "y_m" (its translation), then
         the extra parameters that were estimated.
+    noise_covariance
+        Of the same, without what bent surfaces, missing parameters and an unknown turn during the sweeps add.
     surfaces
         Those that were used.
     bending_m
@@ -103,6 +109,11 @@ class MountingEstimate:
         What single sweeps' readings seem to be off by beyond their noise: root mean square.
     jumps
         Of the readings, the largest first.
+    bend_m
+        Standard deviation of smooth shapes that the surfaces have, each a root mean square over its surface.
+    turning
+        How much of a turn during the sweeps the readings leave out, and its standard deviation: 0 where the table moves
+        as they have it, 1 where the other way; None where that cannot be asked.
     spread_factor
         By how much more the surfaces disagree with each other than their patches say; the covariance is widened by it
         where it is above 1.
@@ -113,10 +124,13 @@ class MountingEstimate:
     extras: tuple[ExtraParameter, ...]
     parameter_names: tuple[str, ...]
     covariance: FloatArray
+    noise_covariance: FloatArray
     surfaces: tuple[FlatSurface, ...]
     bending_m: float
     reading_scatter_rad: float
     jumps: tuple[ReadingJump, ...]
+    bend_m: float
+    turning: tuple[float, float] | None
     spread_factor: float
     converged: bool
     quality: Quality

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,10 +11,11 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.se3 import Pose, skew
 from lidarpose.model.beam_correction import BeamCorrection
-from lidarpose.model.calibration import Quality, TurntableCalibration
-from lidarpose.model.spun_scan import FlatReturns, FlatSurface, MountingEstimate, ReadingJump
+from lidarpose.model.calibration import TurntableCalibration
+from lidarpose.model.spun_scan import FlatReturns, FlatSurface, MountingEstimate
 from lidarpose.model.turntable import PARAMETER_NAMES
 from lidarpose.model.turntable_result import ExtraParameter
+from lidarpose.refine.bent_surfaces import bend_of
 from lidarpose.refine.flatness import (
     EXTRA_NAMES,
     MOUNTING_NAMES,
@@ -27,7 +28,9 @@ from lidarpose.refine.flatness import (
     solve,
     start_state,
 )
+from lidarpose.refine.mounting_verdict import IN_WORDS, Findings, MountingOptions, quality_of
 from lidarpose.refine.reading_jumps import reading_jumps
+from lidarpose.refine.sweep_turning import sweep_turning
 from lidarpose.refine.turntable_state import regular_motion
 
 # A mounting less certain than this is not known; the estimate may then be anywhere.
@@ -39,44 +42,7 @@ LARGEST_EXTRA_SIGMA = {"encoder_scale": 0.02, "range_offset_m": 0.03, "beam_angl
 # less is no main cause of a misfit.
 SUGGESTED_SIGMAS = 6.0
 SUGGESTED_SHARE = 0.1
-# Surfaces that disagree by this much more than their patches do are not all flat, or not all still.
-LARGEST_SPREAD_FACTOR = 3.0
-LARGEST_BENDING_SHARE = 0.6
-LARGEST_READING_SCATTER_RAD = np.radians(0.25)
 LEAST_SURFACES = 3
-IN_WORDS = {
-    "encoder_scale": ("the turntable's readings are off by a factor", "encoder-scale"),
-    "range_offset_m": ("the ranges are off by a constant", "range-offset"),
-    "beam_angle_scale": ("the beam angles are off by a factor", "beam-angle-scale"),
-}
-
-
-@dataclass(frozen=True)
-class MountingOptions:
-    """What to estimate beside the mounting, and what is good enough.
-
-    Attributes
-    ----------
-    estimate
-        Of `lidarpose.refine.flatness.EXTRA_NAMES`.
-    want_mm, want_deg
-        Standard deviation of the LiDAR's place and tilt that still counts as good.
-    """
-
-    estimate: tuple[str, ...] = ()
-    want_mm: float = 20.0
-    want_deg: float = 0.3
-
-    def __post_init__(self) -> None:
-        unknown = [name for name in self.estimate if name not in EXTRA_NAMES]
-        if unknown:
-            raise ValueError(f"no such parameter: {', '.join(unknown)}; known are {', '.join(EXTRA_NAMES)}")
-
-    @property
-    def free(self) -> IntArray:
-        """Indices of what is estimated."""
-        extras = [N_MOUNTING + EXTRA_NAMES.index(name) for name in EXTRA_NAMES if name in self.estimate]
-        return np.array([*range(N_MOUNTING), *extras], dtype=np.int64)
 
 
 def refine_mounting(
@@ -121,26 +87,53 @@ def refine_mounting(
         raise _undetermined("The flat surfaces seen leave the mounting open") from error
     _refuse_undetermined(covariance, options.estimate)
     tested = _extras(solution, evidence, options.estimate, covariance)
+    bend = bend_of(solution, returns, solution.line.by_all[:, free])
+    by_noise = evidence.covariance(free, widened=False)
+    covariance = _covering(covariance, by_noise + bend.covariance)
     covariance = _paid_for(covariance, evidence, free, tested)
-    bent = bending(solution, returns)
+    # A parameter that is missing spoils what else is asked.
+    turning = None if any(extra.suggested for extra in tested) else sweep_turning(solution, returns, free)
+    if turning is not None and (turning.contradicted or (turning.open and not options.sweeps_stated)):
+        covariance = covariance + np.outer(turning.move, turning.move)
     jumps, from_steps = reading_jumps(solution, returns)
-    scatter = max(reading_scatter(solution, returns), from_steps)
-    surfaces = _surfaces(solution, evidence, returns)
-    quality = _quality(solution, evidence, tested, covariance, bent, scatter, jumps, surfaces, options)
+    findings = Findings(
+        solution,
+        evidence,
+        tested,
+        covariance,
+        _surfaces(solution, evidence, returns),
+        bending(solution, returns),
+        bend,
+        float(np.sqrt(np.abs(np.linalg.eigvals(np.linalg.solve(by_noise, bend.covariance))).max())),
+        turning,
+        jumps,
+        max(reading_scatter(solution, returns), from_steps),
+    )
     return MountingEstimate(
         solution.state.T_table_lidar,
         origin_rad,
         tested,
         (*MOUNTING_NAMES, *(EXTRA_NAMES[i - N_MOUNTING] for i in free[N_MOUNTING:])),
         covariance,
-        surfaces,
-        bent,
-        scatter,
+        evidence.covariance(free),
+        findings.surfaces,
+        findings.bending_m,
+        findings.reading_scatter_rad,
         jumps,
+        bend.spread_m,
+        None if turning is None else (turning.share, turning.sigma),
         evidence.spread_factor,
         solution.converged,
-        quality,
+        quality_of(findings, options),
     )
+
+
+def _covering(first: FloatArray, second: FloatArray) -> FloatArray:
+    """The smallest covariance that is nowhere below the first, and nowhere below the second in the first's axes."""
+    half = np.linalg.cholesky(first)
+    back = np.linalg.inv(half)
+    ratio, axes = np.linalg.eigh(back @ second @ back.T)
+    return np.asarray(half @ (axes * np.maximum(ratio, 1.0)) @ axes.T @ half.T)
 
 
 def _undetermined(what: str) -> UndeterminedError:
@@ -229,85 +222,6 @@ def _surfaces(solution: Solution, evidence: Evidence, returns: FlatReturns) -> t
         used = int(np.count_nonzero(solution.weight[mine] > 0.5 * full[mine]))
         out.append(FlatSurface(plane, int(mine.sum()), used, float(solution.sigma[k]), float(evidence.pulls[k])))
     return tuple(out)
-
-
-def _quality(
-    solution: Solution,
-    evidence: Evidence,
-    extras: Sequence[ExtraParameter],
-    covariance: FloatArray,
-    bent: float,
-    scatter: float,
-    jumps: Sequence[ReadingJump],
-    surfaces: Sequence[FlatSurface],
-    options: MountingOptions,
-) -> Quality:
-    sigma = np.sqrt(np.diag(covariance))
-    tilt_deg, shift_mm = float(np.degrees(sigma[:2].max())), float(1e3 * sigma[2:4].max())
-    typical = float(np.median(np.repeat(solution.sigma, [s.returns for s in surfaces])))
-    reasons = [_suggestion(extra) for extra in extras if extra.suggested]
-    if not solution.converged:
-        reasons.append("the estimate did not settle: the start may be too far off, or the scene not flat enough")
-    if jumps:
-        reasons.append(_slipped(jumps))
-    if scatter > LARGEST_READING_SCATTER_RAD:
-        reasons.append(
-            f"single sweeps' readings seem to be off by {np.degrees(scatter):.2f} deg or more: a table that slips, "
-            "sticks or reports where it was told to go; no mounting mends that"
-        )
-    if evidence.spread_factor > LARGEST_SPREAD_FACTOR:
-        worst = max(range(len(surfaces)), key=lambda k: surfaces[k].pull)
-        reasons.append(
-            f"the surfaces contradict each other about the mounting by {evidence.spread_factor:.1f} times their noise, "
-            f"most of all the one with {surfaces[worst].returns} returns"
-        )
-    if bent > LARGEST_BENDING_SHARE * typical:
-        reasons.append(f"the surfaces are bent by {1e3 * bent:.1f} mm beyond their noise of {1e3 * typical:.1f} mm")
-    if tilt_deg > options.want_deg or shift_mm > options.want_mm:
-        reasons.append(
-            f"standard deviations of {tilt_deg:.2g} deg and {shift_mm:.3g} mm; wanted are {options.want_deg:g} deg "
-            f"and {options.want_mm:g} mm: record more of the turn, or surfaces on more sides"
-        )
-    figures = {
-        "method": "flatness",
-        "surfaces": len(surfaces),
-        "returns": int(sum(s.returns for s in surfaces)),
-        "sigma_tilt_deg": tilt_deg,
-        "sigma_shift_mm": shift_mm,
-        "range_noise_mm": 1e3 * typical,
-        "bending_mm": 1e3 * bent,
-        "reading_scatter_deg": float(np.degrees(scatter)),
-        "reading_jumps": [
-            {
-                "sweeps": list(jump.sweeps),
-                "stated_deg": float(np.degrees(jump.stated_rad)),
-                "seen_deg": float(np.degrees(jump.seen_rad)),
-            }
-            for jump in jumps
-        ],
-        "spread_factor": evidence.spread_factor,
-    }
-    return Quality("doubtful" if reasons else "good", tuple(reasons), figures)
-
-
-def _slipped(jumps: Sequence[ReadingJump]) -> str:
-    worst = jumps[0]
-    more = f", and {len(jumps) - 1} times more" if len(jumps) > 1 else ""
-    first, second = worst.sweeps
-    seen, stated = np.degrees(worst.seen_rad), np.degrees(worst.stated_rad)
-    return (
-        f"between sweeps {first} and {second} the table turned by {seen:.1f} deg where its readings say {stated:.1f}"
-        f"{more}: it slips or sticks, or sweeps were lost; no mounting mends that"
-    )
-
-
-def _suggestion(extra: ExtraParameter) -> str:
-    words, option = IN_WORDS[extra.name]
-    if extra.name.endswith("_m"):
-        size = f"{1e3 * extra.value:.1f} mm (standard deviation {1e3 * extra.sigma:.1f})"
-    else:
-        size = f"{1e2 * extra.value:.2f} % (standard deviation {1e2 * extra.sigma:.2f})"
-    return f"{words}, it seems, by about {size}: try --estimate {option}"
 
 
 def mounting_calibration(estimate: MountingEstimate) -> TurntableCalibration:

@@ -15,15 +15,17 @@ import numpy as np
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
-from lidarpose.geometry.se3 import Pose
+from lidarpose.geometry.se3 import Pose, log_so3
 from lidarpose.measure.cloud_beams import recording_of_ideal_cloud
+from lidarpose.model.calibration import Quality
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.plane_patch import PlanePatch
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.spun_scan import FlatReturns, MountingEstimate, MountingRun
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.refine.flatness import EXTRA_NAMES, points_in_table
-from lidarpose.refine.mounting import MountingOptions, mounting_calibration, refine_mounting
+from lidarpose.refine.mounting import mounting_calibration, refine_mounting
+from lidarpose.refine.mounting_verdict import LARGEST_BEND_FACTOR, MountingOptions
 
 # Enough for a tenth of a millimetre on a wall; a search for planes in more takes its time.
 MOST_RETURNS = 120_000
@@ -36,6 +38,8 @@ LEAST_RETURNS = 150
 WIDEST_SPREAD = 2.5
 # Settled is what moves by less than this share of its standard deviation.
 SETTLED = 0.5
+# Surfaces that bend by less than this share of what they did are flatter, and not by chance.
+FLATTER = 0.5
 
 
 def axis_in_fan(axis_beam_rad: float) -> Pose:
@@ -97,8 +101,31 @@ def calibrate_by_flatness(
         If too few surfaces are found, or they do not tell the mounting.
     """
     options = options or MountingOptions()
+    if recording.has_reading_per_beam:
+        options = replace(options, sweeps_stated=True, reading_a_beam=True)
     returns = _all_returns(recording)
     origin_rad = 0.5 * float(returns.reading_rad.min() + returns.reading_rad.max())
+    estimate, rounds = _settled(returns, T_table_lidar, options, origin_rad, step)
+    if returns.left_out_rad is not None and estimate.quality.figures["bend_factor"] > LARGEST_BEND_FACTOR:
+        # Surfaces that bend: perhaps they are flat to a table that moved during the sweeps the other way.
+        moved = replace(returns, reading_rad=returns.reading_rad + returns.left_out_rad, left_out_rad=None)
+        try:
+            other, _ = _settled(moved, T_table_lidar, replace(options, sweeps_stated=True), origin_rad)
+            estimate = _against_other_rig(estimate, other, options)
+        except UndeterminedError:
+            pass
+    calibration = replace(mounting_calibration(estimate), provenance=dict(provenance or {}))
+    return MountingRun(calibration, estimate, len(returns), rounds)
+
+
+def _settled(
+    returns: FlatReturns,
+    T_table_lidar: Pose,
+    options: MountingOptions,
+    origin_rad: float,
+    step: Callable[[], None] | None = None,
+) -> tuple[MountingEstimate, int]:
+    """Surfaces and mounting in turn until they agree, and after how many rounds."""
     pose, extras = T_table_lidar, np.zeros(len(EXTRA_NAMES))
     before: FloatArray | None = None
     rounds = 0
@@ -111,14 +138,43 @@ def calibrate_by_flatness(
         if step is not None:
             step()
         now = _as_numbers(estimate)
-        if before is not None and _moved(now - before, estimate, T_table_lidar) < SETTLED:
-            break
+        if before is not None and _moved(now - before, estimate) < SETTLED:
+            return estimate, rounds
         if rounds == MOST_ROUNDS:
-            estimate = _unsettled(estimate)
-            break
+            return _unsettled(estimate), rounds
         before = now
-    calibration = replace(mounting_calibration(estimate), provenance=dict(provenance or {}))
-    return MountingRun(calibration, estimate, len(returns), rounds)
+
+
+def _against_other_rig(
+    estimate: MountingEstimate, other: MountingEstimate, options: MountingOptions
+) -> MountingEstimate:
+    """Doubtful, and as uncertain as both rigs are apart, where the surfaces are flatter to the other one."""
+    if other.bend_m > FLATTER * estimate.bend_m or other.bending_m > FLATTER * estimate.bending_m:
+        return estimate
+    apart = np.zeros(len(estimate.covariance))
+    turned = log_so3(other.T_table_lidar.rotation @ estimate.T_table_lidar.rotation.T)
+    # A turn about the axis is the choice of the frame, and small here.
+    apart[:2], apart[2:4] = turned[:2], (other.T_table_lidar.translation - estimate.T_table_lidar.translation)[:2]
+    for k, name in enumerate(estimate.parameter_names[4:], start=4):
+        apart[k] = other.extra_values[name] - estimate.extra_values[name]
+    quality = estimate.quality
+    moved, remedy = (
+        ("stood still during each sweep", "leave out --never-stops")
+        if options.reading_a_beam
+        else ("turned on during the sweeps", "give --never-stops")
+    )
+    reason = (
+        f"the surfaces are flat as if the table {moved} (bulges of {1e3 * other.bend_m:.2g} mm in place of "
+        f"{1e3 * estimate.bend_m:.2g}): {remedy}"
+    )
+    covariance = estimate.covariance + np.outer(apart, apart)
+    sigma = np.sqrt(np.diag(covariance))
+    figures = {
+        **quality.figures,
+        "sigma_tilt_deg": float(np.degrees(sigma[:2].max())),
+        "sigma_shift_mm": float(1e3 * sigma[2:4].max()),
+    }
+    return replace(estimate, covariance=covariance, quality=Quality("doubtful", (reason, *quality.reasons), figures))
 
 
 def _all_returns(recording: SweepRecording) -> FlatReturns:
@@ -137,7 +193,34 @@ def _all_returns(recording: SweepRecording) -> FlatReturns:
     else:
         of_return = reading[sweep]
     ranges = np.asarray(recording.range_m)[sweep, beam].astype(np.float64)
-    return FlatReturns(of_return, recording.beam_angle_rad[beam], ranges, sweep, np.zeros(len(sweep), dtype=np.int64))
+    left_out = _left_out(recording)
+    return FlatReturns(
+        of_return,
+        recording.beam_angle_rad[beam],
+        ranges,
+        sweep,
+        np.zeros(len(sweep), dtype=np.int64),
+        None if left_out is None else left_out[sweep, beam],
+    )
+
+
+def _left_out(recording: SweepRecording) -> FloatArray | None:
+    """By how much further (N, M) each beam would find the table if that moved during sweeps as the readings do not say.
+
+    It turns on evenly to the next reading, the mirror once a sweep (as in
+    `lidarpose.measure.assemble.readings_between`), or stands still at the first beam's reading where each beam has its
+    own. None where both are the same.
+    """
+    reading = recording.turntable_angle_rad
+    if recording.has_reading_per_beam:
+        left_out = reading[:, :1] - reading
+    elif len(reading) < 2:
+        return None
+    else:
+        beam = recording.beam_angle_rad
+        steps = np.append(np.diff(reading), reading[-1] - reading[-2])
+        left_out = steps[:, None] * np.abs(beam - beam[0]) / (2.0 * np.pi)
+    return left_out if np.abs(left_out).max() > 0.0 else None
 
 
 def _flat_returns(returns: FlatReturns, pose: Pose, extras: FloatArray, origin_rad: float) -> FlatReturns:
@@ -147,8 +230,14 @@ def _flat_returns(returns: FlatReturns, pose: Pose, extras: FloatArray, origin_r
     patches = _surfaces_among(found)
     index: IntArray = np.concatenate([p.indices for p in patches]) if patches else np.zeros(0, dtype=np.int64)
     surface = np.repeat(np.arange(len(patches)), [len(p) for p in patches])
+    left_out = None if returns.left_out_rad is None else returns.left_out_rad[index]
     return FlatReturns(
-        returns.reading_rad[index], returns.beam_rad[index], returns.range_m[index], returns.sweep[index], surface
+        returns.reading_rad[index],
+        returns.beam_rad[index],
+        returns.range_m[index],
+        returns.sweep[index],
+        surface,
+        left_out,
     )
 
 
@@ -167,9 +256,9 @@ def _as_numbers(estimate: MountingEstimate) -> FloatArray:
     return np.concatenate([estimate.T_table_lidar.rotation.ravel(), estimate.T_table_lidar.translation[:2], values])
 
 
-def _moved(change: FloatArray, estimate: MountingEstimate, start: Pose) -> float:
-    """The largest change of tilt, shift and extra parameters over its standard deviation."""
-    sigma = np.sqrt(np.diag(estimate.covariance))
+def _moved(change: FloatArray, estimate: MountingEstimate) -> float:
+    """The largest change of tilt, shift and extra parameters over its standard deviation by noise."""
+    sigma = np.sqrt(np.diag(estimate.noise_covariance))
     tilt = np.linalg.norm(change[:9]) / np.sqrt(2.0) / max(float(sigma[:2].max()), 1e-12)
     rest = np.abs(change[9:]) / np.maximum(np.concatenate([[sigma[2:4].max()] * 2, sigma[4:]]), 1e-12)
     return float(max(tilt, rest.max()))
