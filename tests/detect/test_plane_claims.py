@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from lidarpose.detect.plane_claims import Slab, patches_of_slabs
+from lidarpose.detect.plane_claims import Ahead, Claim, Slab, patches_of_slabs
 from lidarpose.geometry import compiled
-from lidarpose.geometry.arrays import FloatArray, angle_between
+from lidarpose.geometry.arrays import BoolArray, FloatArray, angle_between
 from lidarpose.geometry.planes import Plane, fit_plane
 
 SIGMA_M = 0.005
@@ -27,6 +27,10 @@ def face(n: int, rng: np.random.Generator) -> FloatArray:
     return np.column_stack([rng.uniform(0.0, 1.0, n), rng.uniform(0.0, 2.0, n), rng.normal(0.0, SIGMA_M, n)])
 
 
+def claims(points: FloatArray, free: BoolArray | None, slabs: list[Slab]) -> list[Claim | None]:
+    return patches_of_slabs(points, free, slabs, ahead=Ahead.where_it_pays(points))
+
+
 def rough(points: FloatArray, seed: int) -> Slab:
     """A slab from few of the points, as a subsample gives it."""
     few = points[np.random.default_rng(seed).integers(0, len(points), 200)]
@@ -36,7 +40,7 @@ def rough(points: FloatArray, seed: int) -> Slab:
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_the_plane_is_that_of_least_squares_over_all_points(dtype: type) -> None:
     points = face(90_000, np.random.default_rng(1)) + [5.0, -3.0, 2.0]
-    answer = patches_of_slabs(points.astype(dtype), None, [rough(points, 1)])[0]
+    answer = claims(points.astype(dtype), None, [rough(points, 1)])[0]
     assert answer is not None
     patch, variances = answer.patch, answer.variances
     best = fit_plane(points[np.abs(points[:, 2] - 2.0) < 3.0 * SIGMA_M])
@@ -54,7 +58,7 @@ def test_a_step_reaches_the_estimate_among_clutter_too() -> None:
     points = np.concatenate([face(40_000, rng), rng.uniform([0, 0, -0.1], [1, 2, 0.1], (80_000, 3))])
     start = Plane(np.array([0.003, 0.002, 1.0]), 0.004)
     slab = Slab.around(points[:400], start, SIGMA_M)
-    answer = patches_of_slabs(points, None, [slab])[0]
+    answer = claims(points, None, [slab])[0]
     assert answer is not None
     plane = answer.patch.plane if answer.patch.plane.normal[2] > 0 else answer.patch.plane.flipped()
     # The same estimate by brute force, taken to its end.
@@ -72,7 +76,7 @@ def test_points_along_a_seam_tilt_neither_plane_and_belong_to_one() -> None:
     floor = face(60_000, rng)
     wall = face(60_000, rng)[:, [2, 1, 0]]
     points = np.concatenate([floor, wall])
-    answers = patches_of_slabs(points, None, [rough(floor, 3), rough(wall, 4)])
+    answers = claims(points, None, [rough(floor, 3), rough(wall, 4)])
     normals = []
     for answer in answers:
         assert answer is not None
@@ -90,9 +94,9 @@ def test_only_free_points_are_taken_and_too_few_are_no_patch() -> None:
     points = face(50_000, np.random.default_rng(4))
     free = np.zeros(len(points), dtype=bool)
     slab = rough(points, 5)
-    assert patches_of_slabs(points, free, [slab]) == [None]
+    assert claims(points, free, [slab]) == [None]
     free[::5] = True
-    answer = patches_of_slabs(points, free, [slab])[0]
+    answer = claims(points, free, [slab])[0]
     assert answer is not None
     assert free[answer.patch.indices].all()
     assert len(answer.patch) == pytest.approx(10_000, rel=0.01)
@@ -101,6 +105,6 @@ def test_only_free_points_are_taken_and_too_few_are_no_patch() -> None:
 def test_what_lies_beside_the_patch_on_its_plane_is_not_of_it() -> None:
     rng = np.random.default_rng(5)
     points = np.concatenate([face(30_000, rng), face(30_000, rng) + [3.0, 0.0, 0.0]])
-    answer = patches_of_slabs(points, None, [rough(points[:30_000], 6)])[0]
+    answer = claims(points, None, [rough(points[:30_000], 6)])[0]
     assert answer is not None
     assert answer.patch.indices.max() < 30_000

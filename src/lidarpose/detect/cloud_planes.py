@@ -10,12 +10,13 @@ faces come up once the large ones are gone.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpose.detect.plane_claims import Slab, patches_of_slabs
+from lidarpose.detect.plane_claims import Ahead, Slab, patches_of_slabs
 from lidarpose.detect.plane_raster import cell_size_m, grown, mean_and_covariance, raster_of
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
@@ -143,13 +144,14 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
     free = np.ones(len(x), dtype=bool)
     patches: list[PlanePatch] = []
     sigma_m: float | None = None
+    ahead = Ahead.where_it_pays(x) if len(x) > DENSE else None
     for _ in range(search.max_rounds):
         at_most = search.max_planes - len(patches)
         count = int(np.count_nonzero(free))
         if count < max(least, POINTS_PER_HYPOTHESIS) or at_most <= 0:
             break
         if count > DENSE:
-            found = _harvest_dense(x, free, count, sigma_m, search, least, at_most, rng)
+            found = _harvest_dense(x, free, count, sigma_m, search, least, at_most, rng, ahead)
         else:
             x = np.ascontiguousarray(x, dtype=np.float32)
             sample = _draw(x, np.flatnonzero(free), sigma_m, search, rng)
@@ -171,6 +173,7 @@ def _harvest_dense(
     least: int,
     at_most: int,
     rng: np.random.Generator,
+    ahead: Ahead | None,
 ) -> list[PlanePatch]:
     """Patches of the `count` free points of a cloud so dense that a subsample shows them; the whole cloud is asked
     once for all of them."""
@@ -189,7 +192,8 @@ def _harvest_dense(
     if not slabs:
         return []
     found = []
-    claims = patches_of_slabs(x, None if count == len(x) else free, slabs, WIDEST * sample.sigma_m)
+    among = None if count == len(x) else free
+    claims = patches_of_slabs(x, among, slabs, WIDEST * sample.sigma_m, ahead)
     for before, claim in zip(seen, claims, strict=True):
         if claim is None or len(claim.patch) < least:
             continue
@@ -227,10 +231,11 @@ def _draw(
     points = x[indices]
     count = min(search.hypotheses, 4 * len(points))
     thinned = points[rng.random(len(points)) < 1.0 / THINNED]
-    seeds, chosen = _neighbourhoods(points, count // 2, rng)
-    if len(thinned) >= POINTS_PER_HYPOTHESIS:
-        more_seeds, more = _neighbourhoods(thinned, count // 2, rng)
-        seeds, chosen = np.concatenate([seeds, more_seeds]), np.concatenate([chosen, more])
+    clouds = [points, thinned] if len(thinned) >= POINTS_PER_HYPOTHESIS else [points]
+    draws = [_Neighbourhoods.drawn(cloud, count // 2, rng) for cloud in clouds]
+    with ThreadPoolExecutor(len(draws)) as pool:
+        chosen = np.concatenate(list(pool.map(_Neighbourhoods.points, draws)))
+    seeds = np.concatenate([draw.cloud[draw.seeds] for draw in draws])
     planes, variances = _local_planes(chosen)
     flat = variances[:, 1] > 0.01 * variances[:, 2]
     if search.from_sensor:
@@ -277,17 +282,28 @@ def _shared(near: Bits, flags: BoolArray) -> IntArray:
 _BITS_OF_BYTE = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint8)
 
 
-def _neighbourhoods(points: Float32Array, count: int, rng: np.random.Generator) -> tuple[Float32Array, Float32Array]:
-    """Random points (count, 3), and (count, K, 3) drawn from their nearest ones, by turns from more and from fewer."""
-    from scipy.spatial import cKDTree
+@dataclass(frozen=True, eq=False)
+class _Neighbourhoods:
+    """Random points `seeds` (H,) of a cloud (S, 3), and `shares` (H, K) of their nearest points, the nearest 0."""
 
-    seeds = rng.integers(0, len(points), count)
-    widest = min(NEIGHBOURHOODS[-1], len(points))
-    tree = cKDTree(points, compact_nodes=False, balanced_tree=False)
-    _, neighbours = tree.query(points[seeds], k=widest)
-    reach = np.minimum(np.array(NEIGHBOURHOODS)[np.arange(count) % len(NEIGHBOURHOODS)], widest)
-    picks = (rng.random((count, POINTS_PER_HYPOTHESIS)) * reach[:, None]).astype(np.int64)
-    return points[seeds], np.asarray(points[np.take_along_axis(neighbours, picks, axis=1)])
+    cloud: Float32Array
+    seeds: IntArray
+    shares: FloatArray
+
+    @staticmethod
+    def drawn(cloud: Float32Array, count: int, rng: np.random.Generator) -> _Neighbourhoods:
+        return _Neighbourhoods(cloud, rng.integers(0, len(cloud), count), rng.random((count, POINTS_PER_HYPOTHESIS)))
+
+    def points(self) -> Float32Array:
+        """(H, K, 3), by turns from more and from fewer of the nearest."""
+        from scipy.spatial import cKDTree
+
+        widest = min(NEIGHBOURHOODS[-1], len(self.cloud))
+        tree = cKDTree(self.cloud, compact_nodes=False, balanced_tree=False)
+        _, neighbours = tree.query(self.cloud[self.seeds], k=widest)
+        reach = np.minimum(np.array(NEIGHBOURHOODS)[np.arange(len(self.seeds)) % len(NEIGHBOURHOODS)], widest)
+        picks = (self.shares * reach[:, None]).astype(np.int64)
+        return np.asarray(self.cloud[np.take_along_axis(neighbours, picks, axis=1)])
 
 
 def _local_planes(chosen: Float32Array) -> tuple[FloatArray, FloatArray]:

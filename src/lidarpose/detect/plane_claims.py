@@ -32,8 +32,8 @@ Float32Array = NDArray[np.float32]
 # would not be, as products with a vector have another limit.
 BLOCK = 32_000
 SLABS_AT_ONCE = 2
-# By how much kernels are done sooner, on two cores.
-SAVED_S_PER_POINT_AND_SLAB = 3e-9
+# By how much kernels are done sooner, on two cores, where some planes are looked for.
+SAVED_S_PER_POINT = 1e-8
 GATE_SIGMAS = 3.0
 # Claimed is more than is kept in the end: what lies around a slab tells whether it is a surface.
 CLAIM_SIGMAS = 6.0
@@ -280,8 +280,41 @@ class Claim:
         return np.concatenate([claims.some(held // EVIDENCE_POINTS + 1) for claims, _ in self.parts])
 
 
+class Ahead:
+    """A cloud's blocks as the kernels want them, prepared by a thread of its own while a subsample is searched."""
+
+    def __init__(self, x: NDArray[np.floating]) -> None:
+        pool = ThreadPoolExecutor(1)
+        self._columns = [pool.submit(_columns, x[block]) for block in _blocks(x)]
+        pool.shutdown(wait=False)
+
+    @staticmethod
+    def where_it_pays(x: NDArray[np.floating]) -> Ahead | None:
+        """None where NumPy is to pass over the cloud."""
+        return Ahead(x) if pays(SAVED_S_PER_POINT * len(x)) else None
+
+    def columns(self, block: slice) -> Float32Array:
+        """Points of a block as rows (3, N)."""
+        columns: Float32Array = self._columns[block.start // BLOCK].result()
+        return columns
+
+
+def _columns(points: NDArray[np.floating]) -> Float32Array:
+    from lidarpose.detect.plane_kernels import columns_of
+
+    return np.asarray(columns_of(np.ascontiguousarray(points)))
+
+
+def _blocks(x: NDArray[np.floating]) -> list[slice]:
+    return [slice(first, min(first + BLOCK, len(x))) for first in range(0, len(x), BLOCK)]
+
+
 def patches_of_slabs(
-    x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab], widest_m: float = np.inf
+    x: NDArray[np.floating],
+    free: BoolArray | None,
+    slabs: Sequence[Slab],
+    widest_m: float = np.inf,
+    ahead: Ahead | None = None,
 ) -> list[Claim | None]:
     """The patches of the whole cloud for those of a subsample, in their order.
 
@@ -292,16 +325,17 @@ def patches_of_slabs(
         Which of them may be taken; None for all.
     widest_m
         No patch spreads more.
+    ahead
+        The points as kernels want them; None for the way of NumPy.
 
     Returns
     -------
     For each slab its patch; None where too few points are there. No point belongs to two.
     """
-    compiled = pays(SAVED_S_PER_POINT_AND_SLAB * len(x) * len(slabs))
-    blocks = [slice(first, min(first + BLOCK, len(x))) for first in range(0, len(x), BLOCK)]
+    blocks = _blocks(x)
     workers = min(os.cpu_count() or 1, len(blocks))
-    claim = _compiled_claims(x, free, slabs) if compiled else partial(_claim, x, free, slabs)
-    members_in = _members_compiled if compiled else _members
+    claim = partial(_claim, x, free, slabs) if ahead is None else _compiled_claims(ahead, free, slabs)
+    members_in = _members if ahead is None else _members_compiled
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(claim, blocks))
         of_slabs = list(pool.map(_screened, slabs, ([part[k] for part in parts] for k in range(len(slabs)))))
@@ -357,11 +391,9 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
     return parts
 
 
-def _compiled_claims(
-    x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab]
-) -> Callable[[slice], list[_Part]]:
+def _compiled_claims(ahead: Ahead, free: BoolArray | None, slabs: Sequence[Slab]) -> Callable[[slice], list[_Part]]:
     """`_claim` by kernels, which drop what is not held."""
-    from lidarpose.detect.plane_kernels import claims_of_block, columns_of
+    from lidarpose.detect.plane_kernels import claims_of_block
 
     gates = np.array([[CLAIM_SIGMAS * s.sigma_m, GATE_SIGMAS * s.sigma_m] for s in slabs])
     rows = np.stack([s.rows[1:] for s in slabs])
@@ -373,7 +405,7 @@ def _compiled_claims(
     all_free = np.zeros(0, dtype=bool)
 
     def claim(block: slice) -> list[_Part]:
-        columns = columns_of(np.ascontiguousarray(x[block]))
+        columns = ahead.columns(block)
         of_block = all_free if free is None else free[block]
         held, ends, disputed, theirs, moments = claims_of_block(
             columns, of_block, single, allowed, starts, widths, gates
