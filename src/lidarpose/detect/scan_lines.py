@@ -20,7 +20,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.circles import fit_circle2
 from lidarpose.geometry.lines import Line2
-from lidarpose.geometry.robust import mad_sigma, tukey_weights
+from lidarpose.geometry.robust import mad_sigma, median, quantile, tukey_weights
 from lidarpose.model.observation import ScanLine
 from lidarpose.model.scan import LidarSpec, Scan
 
@@ -178,7 +178,7 @@ def merge_sweeps(scan: Scan) -> Beams:
     by_range = np.lexsort((ranges, group))
     middle = ranges[by_range][starts + (count - 1) // 2]
     off = np.abs(ranges - middle[group])
-    spread = float(np.quantile(off[count[group] > 1], 0.5)) * 1.6 if np.any(count > 1) else 0.0
+    spread = median(off[count[group] > 1]) * 1.6 if np.any(count > 1) else 0.0
     near = off <= max(5.0 * spread, 1e-9)
     kept = np.bincount(group, near)
     mean = np.bincount(group, np.where(near, ranges, 0.0)) / kept
@@ -197,7 +197,7 @@ def _from_a_gap(beams: Beams) -> Beams:
         return beams
     gaps = np.diff(angle)
     seam = 2.0 * np.pi - (angle[-1] - angle[0])
-    if seam > 4.0 * float(np.median(gaps)):
+    if seam > 4.0 * median(gaps):
         return beams
     steps = np.abs(np.diff(np.log(beams.range_m), append=np.log(beams.range_m[0])))
     if steps[-1] == steps.max():
@@ -218,7 +218,7 @@ def range_noise(beams: Beams) -> float:
         return LEAST_SIGMA_M
     off, factor = _second_differences(beams)
     # 0.35 of the standard normal's absolute values are below 0.4538.
-    noise = float(np.quantile(np.abs(off) / factor, 0.35)) / 0.4538
+    noise = quantile(np.abs(off) / factor, 0.35) / 0.4538
     steps = np.diff(np.unique(np.round(beams.range_m, 7)))
     rounding = float(steps.min()) / np.sqrt(12.0) if len(steps) and len(steps) < 0.5 * len(beams) else 0.0
     return max(noise, rounding, LEAST_SIGMA_M)
@@ -263,7 +263,7 @@ def _straight_runs(beams: Beams, noise: float) -> list[tuple[int, int]]:
     good = chi2 < 4.0 * (WINDOW - 2) + 6.0
     # A long way without returns is a break, unless few beams return at all.
     step = np.diff(beams.angle_rad)
-    far = step > max(40.0 * float(np.median(step)), np.deg2rad(3.0))
+    far = step > max(40.0 * median(step), np.deg2rad(3.0))
     good &= ~sliding_window_view(far, WINDOW - 1).any(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
     return [(int(a), int(b) + WINDOW - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]

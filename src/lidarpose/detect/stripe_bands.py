@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarpose.detect.albedo import PanelAlbedo, edge_scale, erf_table
-from lidarpose.detect.stripe_search import CoarseLine, PanelView
+from lidarpose.detect.albedo import MARGIN, PanelAlbedo, edge_scale, erf_table
+from lidarpose.detect.stripe_search import NODE_STEP, CoarseLine, PanelView
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.robust import MAD_TO_SIGMA
@@ -46,10 +46,11 @@ class Curves:
 
 
 def _horner(coefficients: FloatArray, x: FloatArray) -> FloatArray:
-    value = np.broadcast_to(coefficients[:, -1:], x.shape)
+    value = coefficients[:, -1:]
     for k in range(coefficients.shape[1] - 2, -1, -1):
-        value = value * x + coefficients[:, k : k + 1]
-    return np.asarray(value)
+        value = value * x
+        value += coefficients[:, k : k + 1]
+    return np.asarray(value) if value.shape == x.shape else np.repeat(value, x.shape[1], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,23 +201,37 @@ def for_table(values: FloatArray) -> FloatArray:
     return single if single.ndim == 2 else single[:, None]
 
 
-def fit_curves(bands: Bands, v: FloatArray, weight: FloatArray, degree: int, cubic: BoolArray | None = None) -> Curves:
+@dataclass(frozen=True, eq=False)
+class Powers:
+    """Powers (B, degree + 1, N) of u, in (u - middle) / half: what `fit_curves` fits with, several times."""
+
+    values: FloatArray
+    middle: FloatArray
+    half: FloatArray
+
+    @staticmethod
+    def of(bands: Bands, degree: int) -> Powers:
+        u = bands.u
+        last = u[np.arange(len(u)), np.maximum(np.count_nonzero(bands.valid, axis=1) - 1, 0)][:, None]
+        middle, half = 0.5 * (u[:, :1] + last), np.maximum(0.5 * (last - u[:, :1]), 1.0)
+        values = np.empty((len(u), degree + 1, u.shape[1]))
+        values[:, 0] = 1.0
+        values[:, 1] = (u - middle) / half
+        for k in range(2, degree + 1):
+            np.multiply(values[:, k - 1], values[:, 1], out=values[:, k])
+        return Powers(values, middle, half)
+
+
+def fit_curves(powers: Powers, v: FloatArray, weight: FloatArray, cubic: BoolArray | None = None) -> Curves:
     """Weighted least squares; well conditioned in a coordinate from -1 to 1. Where not `cubic`, without the cube."""
-    u = bands.u
-    last = np.take_along_axis(u, np.maximum(bands.valid.sum(axis=1) - 1, 0)[:, None], axis=1)
-    middle, half = 0.5 * (u[:, :1] + last), np.maximum(0.5 * (last - u[:, :1]), 1.0)
-    s = (u - middle) / half
-    powers = [np.ones_like(s), s]
-    for _ in range(degree - 1):
-        powers.append(powers[-1] * s)
-    design = np.stack(powers, axis=1)
-    weighted = design * weight[:, None]
-    normal = weighted @ design.swapaxes(1, 2)
+    size = powers.values.shape[1]
+    weighted = powers.values * weight[:, None]
+    normal = weighted @ powers.values.swapaxes(1, 2)
     trace = np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-30)
-    normal += np.eye(degree + 1) * (1e-12 * trace)[:, None, None]
+    normal += np.eye(size) * (1e-12 * trace)[:, None, None]
     if cubic is not None:
         normal[:, 3, 3] += np.where(cubic, 0.0, 1e9 * trace)
-    return Curves(np.linalg.solve(normal, weighted @ v[..., None])[..., 0], middle, half)
+    return Curves(np.linalg.solve(normal, weighted @ v[..., None])[..., 0], powers.middle, powers.half)
 
 
 def quantile(values: FloatArray, share: float) -> float:
@@ -230,7 +245,7 @@ def quantiles(values: FloatArray, which: BoolArray, share: float) -> FloatArray:
     count = np.count_nonzero(which, axis=1)
     k = (share * np.maximum(count - 1, 0)).astype(np.intp)
     ordered = np.sort(np.where(which, values, np.inf), axis=1)
-    return np.asarray(np.take_along_axis(ordered, k[:, None], axis=1)[:, 0], dtype=np.float64)
+    return np.asarray(ordered[np.arange(len(k)), k], dtype=np.float64)
 
 
 def spreads(values: FloatArray, which: BoolArray) -> FloatArray:
@@ -266,31 +281,58 @@ def _ambient_products(bands: Bands, centre: FloatArray, beyond: FloatArray) -> t
     return np.einsum("pbn,pbn->bn", bright, bright), np.einsum("pbn,pbn->bn", bright, values)
 
 
+_Two = tuple[FloatArray, ...]
+"""Tables (B, N), float32, for x and for y."""
+
+
 def look_at_albedo(bands: Bands, source: Source, curves: Curves, width: FloatArray) -> Bands:
     """Share of light surface that each pixel sees through stripe and lens (see `laser_stripe`)."""
-    view, steep = source.view, source.steep
-    albedo = view.albedo
     centre, slope = curves.at(bands.u), curves.slope(bands.u)
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
     sine = slope * cosine
-    grid, slopes = view.grid_and_slopes(as_pixels(bands.u, centre, steep))
+    squares = (_squares_compiled if pays(0.0) else _squares)(source, bands.u, centre, cosine, sine, width)
+    light = _light_shares(bands, source.view.albedo, for_table(centre), *squares[:3])
+    return replace(bands, cosine=cosine, sine=sine, light=light, good=bands.good * squares[3])
+
+
+def _squares(
+    source: Source, u: FloatArray, centre: FloatArray, cosine: FloatArray, sine: FloatArray, width: FloatArray
+) -> tuple[_Two, _Two, _Two, FloatArray]:
+    """Grid coordinates at the centres, their change by a pixel along v, the edges' blur, and whether all light falls
+    on usable squares (1, or 0: what lies around the board is not known); float32."""
+    view, steep = source.view, source.steep
+    grid, slopes = view.grid_and_slopes(as_pixels(u, centre, steep))
     by_u, by_v = (slopes[..., 1::2], slopes[..., ::2]) if steep else (slopes[..., ::2], slopes[..., 1::2])
     across = by_v * cosine[..., None] - by_u * sine[..., None]
     along = by_u * cosine[..., None] + by_v * sine[..., None]
-    blur2 = np.minimum(albedo.blur_px, width) ** 2
+    blur2 = np.minimum(view.albedo.blur_px, width) ** 2
     thickness = (1.0 - blur2 / width**2)[:, None]
     edges = np.sqrt(blur2[:, None, None] * (thickness[..., None] * across**2 + along**2))
     # A pixel at (0, dv) from the centre is seen at dv along the stripe's tangent plus `thickness` of it across.
     per_v = by_v * (cosine**2 * thickness + sine**2)[..., None]
     per_v = per_v + by_u * ((1.0 - thickness) * cosine * sine)[..., None]
-    inside = _inside_squares(view, grid, across, width)
-    columns = [tuple(for_table(table[..., k]) for k in (0, 1)) for table in (grid, per_v, edges)]
-    light = _light_shares(bands, albedo, for_table(centre), *columns)
-    return replace(bands, cosine=cosine, sine=sine, light=light, good=bands.good * inside)
+    usable = view.albedo.is_usable
+    reach = 2.5 * width[:, None, None] * across
+    inside = (usable(grid) & usable(grid - reach) & usable(grid + reach)).astype(np.float32)
+    first, second, third = (tuple(for_table(t[..., k]) for k in (0, 1)) for t in (grid, per_v, edges))
+    return first, second, third, inside
 
 
-_Two = tuple[FloatArray, ...]
-"""Tables (B, N), float32, for x and for y."""
+def _squares_compiled(
+    source: Source, u: FloatArray, centre: FloatArray, cosine: FloatArray, sine: FloatArray, width: FloatArray
+) -> tuple[_Two, _Two, _Two, FloatArray]:
+    """`_squares` by kernels."""
+    from lidarpose.detect import stripe_kernels
+
+    view, albedo = source.view, source.view.albedo
+    grid, per_v, edges = (np.empty((2, *u.shape), np.float32) for _ in range(3))
+    inside = np.empty(u.shape, np.float32)
+    lowest = -1.0 - MARGIN
+    board = (albedo.grid_map.columns, albedo.grid_map.rows, lowest, np.float32(lowest), MARGIN, albedo.usable)
+    nodes = (view.nodes_and_slopes, view.nodes.shape[0], view.nodes.shape[1], NODE_STEP, view.low)
+    profiles = (u, centre, cosine, sine, width, albedo.blur_px, source.steep)
+    stripe_kernels.squares(*nodes, *board, *profiles, grid, per_v, edges, inside)
+    return tuple(grid), tuple(per_v), tuple(edges), inside
 
 
 def _light_shares(
@@ -313,13 +355,3 @@ def _light_shares(
     dv = bands.v - centre
     x, y = (dv * d + g for g, d in zip(grid, per_v, strict=True))
     return albedo.light_share(x, y, *edges, near=near)
-
-
-def _inside_squares(view: PanelView, grid: FloatArray, across: FloatArray, width: FloatArray) -> FloatArray:
-    """1 for profiles (B, N) whose light falls on usable squares alone: what lies around the board is not known.
-
-    `across` (B, N, 2) is the change of the grid coordinates by a pixel across the stripe.
-    """
-    usable = view.albedo.is_usable
-    reach = 2.5 * width[:, None, None] * across
-    return (usable(grid) & usable(grid - reach) & usable(grid + reach)).astype(np.float32)

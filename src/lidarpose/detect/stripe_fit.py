@@ -20,6 +20,7 @@ import numpy as np
 from lidarpose.detect.stripe_bands import (
     Bands,
     Curves,
+    Powers,
     Ranges,
     Source,
     as_pixels,
@@ -34,7 +35,7 @@ from lidarpose.detect.stripe_bands import (
     spreads,
     usable_ranges,
 )
-from lidarpose.detect.stripe_noise import learn_noise, sampled
+from lidarpose.detect.stripe_noise import NOISE_SAMPLES, learn_noise, sampled
 from lidarpose.detect.stripe_search import CoarseLine, PanelView
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.compiled import pays
@@ -219,15 +220,16 @@ def _first_curves(bands: Bands, share: FloatArray, straight: Curves) -> tuple[Cu
     rest -= rest.mean(axis=0)
     smooth = rest.copy()
     smooth[1:-1] = 0.25 * rest[:-2] + 0.5 * rest[1:-1] + 0.25 * rest[2:]
-    peak = np.argmax(smooth, axis=0)[None]
-    height = np.take_along_axis(smooth, peak, axis=0)[0]
-    v = np.take_along_axis(bands.v, peak, axis=0)[0].astype(np.float64)
+    peak = np.argmax(smooth, axis=0)
+    height = smooth.max(axis=0)
+    v = bands.v[0].astype(np.float64) + peak
     strong = bands.valid & (height > 0.4 * quantiles(height, bands.valid, 0.75)[:, None])
+    powers = Powers.of(bands, 2)
     near, is_ridge, curves = strong, np.ones(len(v), dtype=bool), straight
     for reach in (8.0, 4.0, 2.5):
         near = strong & (np.abs(v - curves.at(bands.u)) <= reach)
         is_ridge &= np.count_nonzero(near, axis=1) >= _MIN_POINTS
-        curves = fit_curves(bands, v, near.astype(np.float64), 2)
+        curves = fit_curves(powers, v, near.astype(np.float64))
     window = np.clip(peak + np.arange(-9, 10)[:, None, None], 0, len(rest) - 1)
     area = np.maximum(np.take_along_axis(rest, window, axis=0), 0.0).sum(axis=0) / np.maximum(height, 1e-3)
     cosine = 1.0 / np.sqrt(1.0 + curves.slope(bands.u) ** 2)
@@ -343,17 +345,14 @@ def _equations_compiled(bands: Bands, state: _State, *, learn: bool) -> tuple[li
 
 
 def _samples(bands: Bands, state: _State, bell: FloatArray) -> list[tuple[FloatArray, ...]]:
-    """Residual, level and signal of some pixels of each band, as `_equations` has them of all."""
-    found: list[tuple[FloatArray, ...]] = []
-    count = bands.v.shape[2]
-    for b, k in sampled(bands.good):
-        n = k % count
-        values, ambient, light, peak = (x[:, b].ravel()[k] for x in (bands.values, bands.ambient, bands.light, bell))
-        ratio = np.float32(state.dark_ratio[b])
-        height, background = (np.asarray(x[b], dtype=np.float32)[n] for x in (state.height, state.background))
-        signal = height * (peak * (ratio + (1 - ratio) * light))
-        found.append((values - background - signal, np.maximum(values + ambient, np.float32(0.0)), signal))
-    return found
+    """Residual, level and signal of some pixels of each band, as `_equations` has them of all, by kernels."""
+    from lidarpose.detect import stripe_kernels
+
+    tables = (bands.values, bands.ambient, bands.good, bands.light, bell)
+    profiles = (for_table(state.height), for_table(state.background), np.asarray(state.dark_ratio, dtype=np.float32))
+    found = np.empty((len(state.width), 3, 2 * NOISE_SAMPLES), np.float32)
+    counts = stripe_kernels.samples(*tables, *profiles, NOISE_SAMPLES, found)
+    return [tuple(found[b, :, :count]) for b, count in enumerate(counts)]
 
 
 def _normal_equations(J: Sequence[FloatArray], residual: FloatArray, weight: FloatArray) -> list[FloatArray]:
@@ -411,9 +410,10 @@ def _smooth(bands: Bands, state: _State) -> _Smooth:
     robust = weight
     cubic = np.count_nonzero(known, axis=1) > 60
     enough = np.ones(len(sigma), dtype=bool)
+    powers = Powers.of(bands, 3)
     for _ in range(3):
         enough &= np.count_nonzero(robust, axis=1) >= _MIN_POINTS
-        curves = fit_curves(bands, state.centre, robust, 3, cubic)
+        curves = fit_curves(powers, state.centre, robust, cubic)
         residual = state.centre - curves.at(bands.u)
         standardised = residual / sigma
         scale = np.maximum(np.where(enough, spreads(standardised, known), 1.0), 1.0)[:, None]

@@ -308,6 +308,119 @@ def cut_band(
 
 
 @kernel
+def samples(
+    values: Any,
+    ambient: Any,
+    good: Any,
+    light: Any,
+    bell: Any,
+    height: Any,
+    background: Any,
+    ratio: Any,
+    most: int,
+    found: Any,
+) -> Any:
+    """As `stripe_noise.sampled` picks them: residual, level and signal (B, 3, M) of pixels, and how many each (B,)."""
+    profile_pixels, bands, profiles = values.shape
+    zero, one = np.float32(0.0), np.float32(1.0)
+    counts = np.zeros(bands, np.int64)
+    for b in range(bands):
+        total = 0
+        for p in range(profile_pixels):
+            for n in range(profiles):
+                total += good[p, b, n] != zero
+        step, dark, rest = max(total // most, 1), ratio[b], one - ratio[b]
+        number, taken = 0, 0
+        for p in range(profile_pixels):
+            for n in range(profiles):
+                if good[p, b, n] != zero:
+                    if number == 0:
+                        signal = height[b, n] * (bell[p, b, n] * (dark + rest * light[p, b, n]))
+                        level = values[p, b, n] + ambient[p, b, n]
+                        found[b, 0, taken] = values[p, b, n] - background[b, n] - signal
+                        found[b, 1, taken] = level if level > zero else zero
+                        found[b, 2, taken] = signal
+                        taken += 1
+                        number = step
+                    number -= 1
+        counts[b] = taken
+    return counts
+
+
+@kernel
+def _usable(x: Any, y: Any, lowest: Any, right: float, bottom: float, two: Any, usable: Any) -> bool:
+    """`PanelAlbedo.is_usable` at grid coordinates; `lowest` and `two` have the precision of x and y."""
+    if not (x > lowest and y > lowest and x < right and y < bottom):
+        return False
+    rows, columns = usable.shape
+    i = min(max(np.int64(np.floor(x + two)), 0), columns - 1)
+    j = min(max(np.int64(np.floor(y + two)), 0), rows - 1)
+    return bool(usable[j, i])
+
+
+@kernel
+def squares(
+    table: Any,
+    node_rows: Any,
+    node_columns: Any,
+    node_step: Any,
+    low: Any,
+    columns: Any,
+    rows: Any,
+    lowest: Any,
+    lowest_single: Any,
+    margin: Any,
+    usable: Any,
+    u: Any,
+    centre: Any,
+    cosine: Any,
+    sine: Any,
+    width: Any,
+    blur: Any,
+    steep: Any,
+    grid: Any,
+    per_v: Any,
+    edges: Any,
+    inside: Any,
+) -> None:
+    """`stripe_bands._squares`, into `grid`, `per_v`, `edges` (2, B, N) and `inside` (B, N)."""
+    one, two = np.float32(1.0), np.float32(2.0)
+    right, bottom = columns + margin, rows + margin
+    at = np.empty(6, np.float32)
+    across = np.empty(2)
+    for b in range(u.shape[0]):
+        smaller = min(blur, width[b])
+        blur2 = smaller * smaller
+        thickness = 1.0 - blur2 / (width[b] * width[b])
+        reach = 2.5 * width[b]
+        for n in range(u.shape[1]):
+            px, py = (centre[b, n], u[b, n]) if steep else (u[b, n], centre[b, n])
+            column, row = (px - low[0]) / node_step, (py - low[1]) / node_step
+            i = min(max(np.int64(column), 0), node_columns - 2)
+            j = min(max(np.int64(row), 0), node_rows - 2)
+            x, y = np.float32(column - i), np.float32(row - j)
+            first = j * node_columns + i
+            for k in range(6):
+                upper = table[first, k] * (one - x) + table[first + 1, k] * x
+                lower = table[first + node_columns, k] * (one - x) + table[first + node_columns + 1, k] * x
+                at[k] = upper * (one - y) + lower * y
+            c, s = cosine[b, n], sine[b, n]
+            for k in range(2):
+                by_first, by_second = at[2 + 2 * k], at[3 + 2 * k]
+                by_u, by_v = (by_second, by_first) if steep else (by_first, by_second)
+                across[k] = by_v * c - by_u * s
+                along = by_u * c + by_v * s
+                edges[k, b, n] = np.sqrt(blur2 * (thickness * (across[k] * across[k]) + along * along))
+                per_v[k, b, n] = by_v * (c * c * thickness + s * s) + by_u * ((1.0 - thickness) * c * s)
+                grid[k, b, n] = at[k]
+            dx, dy = reach * across[0], reach * across[1]
+            fine = _usable(at[0], at[1], lowest_single, right, bottom, two, usable)
+            fine = fine and _usable(at[0] - dx, at[1] - dy, lowest, right, bottom, 2.0, usable)
+            fine = fine and _usable(at[0] + dx, at[1] + dy, lowest, right, bottom, 2.0, usable)
+            inside[b, n] = np.float32(1.0) if fine else np.float32(0.0)
+
+
+@kernel
 def block_means(image: Any, low: Any, high: Any, factor: int) -> Any:
     """`stripe_search.reduce_image` of the part of an 8-bit image from `low` up to `high`, by 2, 3 or 4."""
     height, width = (high[1] - low[1]) // factor, (high[0] - low[0]) // factor

@@ -13,15 +13,15 @@ import numpy as np
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.robust import MAD_TO_SIGMA
 
-# Pixels that the noise is learnt from, and the bins they are sorted into.
-_NOISE_SAMPLES, _NOISE_BINS = 1200, 8
+# Pixels that the noise is learnt from, at least (and fewer than twice as many), and the bins they are sorted into.
+NOISE_SAMPLES, _NOISE_BINS = 1200, 8
 
 
 def sampled(good: FloatArray) -> Iterator[tuple[int, IntArray]]:
     """Each band b of a table (P, B, N) of good pixels, and flat indices (M,) into its [:, b] of some of them."""
     for b in range(good.shape[1]):
         some = np.flatnonzero(good[:, b])
-        yield b, some[:: max(len(some) // _NOISE_SAMPLES, 1)]
+        yield b, some[:: max(len(some) // NOISE_SAMPLES, 1)]
 
 
 def learn_noise(samples: Sequence[tuple[FloatArray, ...]], before: FloatArray) -> FloatArray:

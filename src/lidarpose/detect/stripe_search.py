@@ -34,7 +34,7 @@ _MISFIT = 0.12
 # Lines sharper than the one, and wider than the other, are told apart (see `_sharpness`).
 _NARROW, _WIDE = 0.65, 0.45
 # Pixels between the places where grid coordinates are computed; between them they are interpolated (to 0.01 px).
-_NODE_STEP = 8
+NODE_STEP = 8
 # Reduced pixels of each colour that tell the ambient light.
 _LEVEL_SAMPLES = 400
 
@@ -118,7 +118,7 @@ class PanelView:
     def grid_and_slopes(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Grid coordinates (..., 2) at pixels (..., 2), and their derivatives (..., 4) as in `slopes`."""
         # By hand: remap rounds to 1/32 of a node's distance, which is a quarter of a pixel.
-        column, row = ((pixels[..., k] - self.low[k]) / _NODE_STEP for k in (0, 1))
+        column, row = ((pixels[..., k] - self.low[k]) / NODE_STEP for k in (0, 1))
         height, width = self.nodes.shape[:2]
         i = np.clip(column.astype(np.intp), 0, width - 2)
         j = np.clip(row.astype(np.intp), 0, height - 2)
@@ -166,11 +166,11 @@ def _usable_pixels(albedo: PanelAlbedo, grid: FloatArray) -> BoolArray:
 
 
 def _nodes(albedo: PanelAlbedo, low: IntArray, high: IntArray) -> tuple[FloatArray, FloatArray]:
-    y, x = np.mgrid[low[1] : high[1] + _NODE_STEP : _NODE_STEP, low[0] : high[0] + _NODE_STEP : _NODE_STEP]
+    y, x = np.mgrid[low[1] : high[1] + NODE_STEP : NODE_STEP, low[0] : high[0] + NODE_STEP : NODE_STEP]
     grid = albedo.grid_map.grid(np.stack([x, y], axis=-1))
     # By u and by v, from the neighbouring nodes: far closer than the nodes' own bilinear interpolation needs.
     edge_order: Literal[1, 2] = 2 if min(grid.shape[:2]) > 2 else 1
-    by_u, by_v = (np.gradient(grid, float(_NODE_STEP), axis=k, edge_order=edge_order) for k in (1, 0))
+    by_u, by_v = (np.gradient(grid, float(NODE_STEP), axis=k, edge_order=edge_order) for k in (1, 0))
     slopes = np.stack([by_u[..., 0], by_v[..., 0], by_u[..., 1], by_v[..., 1]], axis=-1)
     return grid.astype(np.float32), slopes.astype(np.float32)
 
@@ -183,7 +183,7 @@ def _pixel_centres(shape: tuple[int, ...], factor: int) -> tuple[FloatArray, Flo
 
 def interpolate(nodes: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
     """Values (..., channels) of a table of nodes at pixels u, v (...) from its corner; bilinear, to a quarter pixel."""
-    step = np.float32(_NODE_STEP)
+    step = np.float32(NODE_STEP)
     return np.asarray(cv2.remap(nodes, u / step, v / step, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
