@@ -220,6 +220,7 @@ _EXPORT = ("storage.exports:write_export",)
 _TEXT = ("storage.atomic:write_text",)
 _REPORTS = (
     "cli.calibrate:_write_report",
+    "cli.calibrate_recording:calibrate_recording",
     "cli.calibrate_world:calibrate_world_session",
     "cli.measure_disk:measure_disk",
 )

@@ -163,6 +163,7 @@ def test_from_a_folder_to_a_straight_room(tmp_path: Path, capsys: pytest.Capture
     assert run([*call, "-o", str(tmp_path / "full"), "--estimate", "beam-angle-scale"]) == 0
     full = json.loads(capsys.readouterr().out)
     assert full["verdict"] == "good"
+    assert "<html" in (tmp_path / "full" / "report.html").read_text(encoding="utf-8")
     calibration = read_turntable_calibration(tmp_path / "full" / "calibration.json")
     assert calibration.beams.angle_scale == pytest.approx(180.0 / 175.0, abs=1e-3)
     # What is scanned with the file has the angles of the room; with the plain one it has not.

@@ -53,7 +53,7 @@ def calibrate(
     """Find the LiDAR's pose from a session: DIR/calibration.json and DIR/report.html.
 
     The kind of session, turntable or corner, is told by its session.toml. A sweep recording of a room calibrates
-    its own rig without camera and target: sought is the mounting at which what is flat is flat (no report.html then).
+    its own rig without camera and target: sought is the mounting at which what is flat is flat.
 
     Parameters
     ----------
@@ -111,6 +111,7 @@ def calibrate(
             want_mm,
             want_deg,
             never_stops=never_stops,
+            report=report,
             json=json,
             quiet=quiet,
         )
@@ -161,6 +162,7 @@ def _calibrate_recording(
     want_deg: float | None,
     *,
     never_stops: bool | None,
+    report: bool,
     json: bool,
     quiet: bool,
 ) -> None:
@@ -177,6 +179,7 @@ def _calibrate_recording(
         estimate=estimate,
         want_mm=want_mm,
         want_deg=want_deg,
+        report=report,
         json=json,
         quiet=quiet,
     )

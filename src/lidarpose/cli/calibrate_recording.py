@@ -21,13 +21,6 @@ _EXTRAS = {
 }
 
 
-MIRROR_NOTE = (
-    "Seen from where the axis points, the table is taken to turn anticlockwise as its readings grow. If yours turns "
-    "clockwise, all that is scanned comes out as in a mirror, just as flat: give the beam that points the other way "
-    "(--axis-beam-deg plus 180)."
-)
-
-
 def calibrate_recording(
     folder: Path,
     output: Path,
@@ -38,10 +31,11 @@ def calibrate_recording(
     estimate: tuple[str, ...] = (),
     want_mm: float | None = None,
     want_deg: float | None = None,
+    report: bool = True,
     json: bool = False,
     quiet: bool = False,
 ) -> MountingRun:
-    """Calibrate from a sweep recording and write `output`/calibration.json.
+    """Calibrate from a sweep recording and write `output`/calibration.json and `output`/report.html.
 
     Parameters
     ----------
@@ -52,6 +46,8 @@ def calibrate_recording(
         Readings are interpolated by the sweeps' times; False says that the table stops for each sweep, None nothing.
     estimate
         Extra parameters by their names on the command line.
+    report
+        Write the report too.
 
     Raises
     ------
@@ -62,6 +58,8 @@ def calibrate_recording(
     """
     from lidarpose.cli.console import out, print_json, progress
     from lidarpose.refine.mounting_verdict import MountingOptions
+    from lidarpose.report.mounting_page import mounting_page
+    from lidarpose.storage.atomic import write_text
     from lidarpose.storage.calibration import write_calibration
     from lidarpose.storage.provenance import provenance
     from lidarpose.storage.recording import read_recording, recording_files
@@ -94,8 +92,11 @@ def calibrate_recording(
             provenance=provenance("calibrate", folder, recording_files(folder), stated),
             step=advance,
         )
-    written = output / "calibration.json"
-    write_calibration(written, run.calibration)
+    written = [output / "calibration.json"]
+    write_calibration(written[0], run.calibration)
+    if report:
+        written.append(output / "report.html")
+        write_text(written[1], mounting_page(run, recording.name))
     if json:
         print_json(summary(run))
     else:
@@ -135,6 +136,8 @@ def _start(axis_beam_deg: float | None, start: Path | None) -> Pose:
 
 def summary(run: MountingRun) -> dict[str, Any]:
     """The result as a JSON object; units in the keys."""
+    from lidarpose.report.mounting_page import MIRROR_NOTE
+
     estimate, quality = run.estimate, run.estimate.quality
     return {
         "kind": "turntable",
@@ -168,17 +171,12 @@ def summary(run: MountingRun) -> dict[str, Any]:
     }
 
 
-def _print(console: Console, run: MountingRun, written: Path) -> None:
-    from lidarpose.report.page import Verdict
+def _print(console: Console, run: MountingRun, written: list[Path]) -> None:
+    from lidarpose.report.mounting_page import MIRROR_NOTE, mounting_verdict
     from lidarpose.report.summary import figures_table, print_verdict
 
-    estimate, quality = run.estimate, run.estimate.quality
-    figures = quality.figures
-    say = (
-        f"{figures['surfaces']} flat surfaces with {figures['returns']} returns; tilt known to "
-        f"{figures['sigma_tilt_deg']:.3g} deg, place to {figures['sigma_shift_mm']:.3g} mm"
-    )
-    print_verdict(console, Verdict(quality.verdict, "Mounting from flatness", say, quality.reasons))
+    estimate = run.estimate
+    print_verdict(console, mounting_verdict(run))
     x, y, z = estimate.T_table_lidar.rotation[2]
     radius_mm = 1e3 * run.calibration.motion.radius_m
     console.print(
@@ -191,4 +189,5 @@ def _print(console: Console, run: MountingRun, written: Path) -> None:
         rows.append((extra.name, f"{factor * extra.value:.3f} {unit}", f"{factor * extra.sigma:.3f} {unit}", state))
     console.print(figures_table("Further parameters", ("value", "standard deviation", ""), rows))
     console.print(MIRROR_NOTE, markup=False, soft_wrap=True)
-    console.print(f"written: {written}", markup=False, soft_wrap=True)
+    for file in written:
+        console.print(f"written: {file}", markup=False, soft_wrap=True)

@@ -142,10 +142,33 @@ class MountingEstimate:
 
 
 @dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """The returns of an estimate as it puts them.
+
+    Attributes
+    ----------
+    points : (n, 3)
+        In the table's frame.
+    surface : (n,)
+        Which of the estimate's surfaces a return lies on.
+    off_m : (n,)
+        Its distance from that plane, positive along the normal.
+    """
+
+    points: FloatArray
+    surface: IntArray
+    off_m: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class MountingRun:
-    """A whole self-calibration: the file's content and the evidence."""
+    """A whole self-calibration: the file's content and the evidence.
+
+    `returns` is how many were looked at, `seen` those of them that lie on the surfaces, for a report.
+    """
 
     calibration: TurntableCalibration
     estimate: MountingEstimate
     returns: int
     rounds: int
+    seen: SurfacePoints | None = None

@@ -21,7 +21,7 @@ from lidarpose.model.calibration import Quality
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.plane_patch import PlanePatch
 from lidarpose.model.recording import SweepRecording
-from lidarpose.model.spun_scan import FlatReturns, MountingEstimate, MountingRun
+from lidarpose.model.spun_scan import FlatReturns, MountingEstimate, MountingRun, SurfacePoints
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.refine.flatness import EXTRA_NAMES, points_in_table
 from lidarpose.refine.mounting import mounting_calibration, refine_mounting
@@ -105,17 +105,17 @@ def calibrate_by_flatness(
         options = replace(options, sweeps_stated=True, reading_a_beam=True)
     returns = _all_returns(recording)
     origin_rad = 0.5 * float(returns.reading_rad.min() + returns.reading_rad.max())
-    estimate, rounds = _settled(returns, T_table_lidar, options, origin_rad, step)
+    estimate, flat, rounds = _settled(returns, T_table_lidar, options, origin_rad, step)
     if returns.left_out_rad is not None and estimate.quality.figures["bend_factor"] > LARGEST_BEND_FACTOR:
         # Surfaces that bend: perhaps they are flat to a table that moved during the sweeps the other way.
         moved = replace(returns, reading_rad=returns.reading_rad + returns.left_out_rad, left_out_rad=None)
         try:
-            other, _ = _settled(moved, T_table_lidar, replace(options, sweeps_stated=True), origin_rad)
+            other, *_ = _settled(moved, T_table_lidar, replace(options, sweeps_stated=True), origin_rad)
             estimate = _against_other_rig(estimate, other, options)
         except UndeterminedError:
             pass
     calibration = replace(mounting_calibration(estimate), provenance=dict(provenance or {}))
-    return MountingRun(calibration, estimate, len(returns), rounds)
+    return MountingRun(calibration, estimate, len(returns), rounds, _as_seen(flat, estimate))
 
 
 def _settled(
@@ -124,8 +124,8 @@ def _settled(
     options: MountingOptions,
     origin_rad: float,
     step: Callable[[], None] | None = None,
-) -> tuple[MountingEstimate, int]:
-    """Surfaces and mounting in turn until they agree, and after how many rounds."""
+) -> tuple[MountingEstimate, FlatReturns, int]:
+    """Surfaces and mounting in turn until they agree; the returns on the surfaces, and after how many rounds."""
     pose, extras = T_table_lidar, np.zeros(len(EXTRA_NAMES))
     before: FloatArray | None = None
     rounds = 0
@@ -139,9 +139,9 @@ def _settled(
             step()
         now = _as_numbers(estimate)
         if before is not None and _moved(now - before, estimate) < SETTLED:
-            return estimate, rounds
+            return estimate, flat, rounds
         if rounds == MOST_ROUNDS:
-            return _unsettled(estimate), rounds
+            return _unsettled(estimate), flat, rounds
         before = now
 
 
@@ -175,6 +175,17 @@ def _against_other_rig(
         "sigma_shift_mm": float(1e3 * sigma[2:4].max()),
     }
     return replace(estimate, covariance=covariance, quality=Quality("doubtful", (reason, *quality.reasons), figures))
+
+
+def _as_seen(flat: FlatReturns, estimate: MountingEstimate) -> SurfacePoints:
+    extras = np.array([estimate.extra_values.get(name, 0.0) for name in EXTRA_NAMES])
+    points = points_in_table(
+        estimate.T_table_lidar, extras, estimate.reading_origin_rad, flat.reading_rad, flat.beam_rad, flat.range_m
+    )
+    planes = [surface.plane for surface in estimate.surfaces]
+    normals, offsets = np.stack([p.normal for p in planes]), np.array([p.offset for p in planes])
+    off_m = (points * normals[flat.surface]).sum(axis=1) - offsets[flat.surface]
+    return SurfacePoints(points, flat.surface, off_m)
 
 
 def _all_returns(recording: SweepRecording) -> FlatReturns:
