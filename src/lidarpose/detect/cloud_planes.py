@@ -33,6 +33,8 @@ DENSE = 200_000
 DENSE_SAMPLE = 8192
 DENSE_HYPOTHESES = 400
 FEWEST_OF_SAMPLE = 30
+# Neighbours of fewer seeds are found sooner than a thread is started.
+MANY_HYPOTHESES = 400
 # So many voxels of the subsample tell whether a patch is a surface, and so many hypotheses' neighbourhoods.
 ENOUGH_EVIDENCE = 1000
 ENOUGH_SEEDS = 12
@@ -233,8 +235,11 @@ def _draw(
     thinned = points[rng.random(len(points)) < 1.0 / THINNED]
     clouds = [points, thinned] if len(thinned) >= POINTS_PER_HYPOTHESIS else [points]
     draws = [_Neighbourhoods.drawn(cloud, count // 2, rng) for cloud in clouds]
-    with ThreadPoolExecutor(len(draws)) as pool:
-        chosen = np.concatenate(list(pool.map(_Neighbourhoods.points, draws)))
+    if count < MANY_HYPOTHESES:
+        chosen = np.concatenate([draw.points() for draw in draws])
+    else:
+        with ThreadPoolExecutor(len(draws)) as pool:
+            chosen = np.concatenate(list(pool.map(_Neighbourhoods.points, draws)))
     seeds = np.concatenate([draw.cloud[draw.seeds] for draw in draws])
     planes, variances = _local_planes(chosen)
     flat = variances[:, 1] > 0.01 * variances[:, 2]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
+from lidarpose.geometry.compiled import pays
 
 CELL_M = 0.15
 # A surface that stands still returns within this of where it did: some times the range noise.
@@ -21,6 +22,8 @@ SLACK_M = 0.04
 REACH_M = 16.0
 # Fewer moved points in a cell are mixed pixels and noise.
 FEWEST_IN_A_CELL = 3
+# By how much kernels are done sooner, on one core.
+SAVED_S_PER_POINT = 2e-8
 
 
 def moved_points(frames: Sequence[NDArray[np.floating[Any]]]) -> tuple[IntArray, ...]:
@@ -31,19 +34,20 @@ def moved_points(frames: Sequence[NDArray[np.floating[Any]]]) -> tuple[IntArray,
     frames
         One frame of each of a few places, metres, finite, the sensor unmoved.
     """
-    low = np.min([f.min(axis=0) for f in frames], axis=0).clip(-REACH_M, REACH_M) - 2.0 * CELL_M
-    high = np.max([f.max(axis=0) for f in frames], axis=0).clip(-REACH_M, REACH_M) + 2.0 * CELL_M
+    rows = [np.ascontiguousarray(frame.T) for frame in frames]
+    low = np.min([f.min(axis=1) for f in rows], axis=0).clip(-REACH_M, REACH_M) - 2.0 * CELL_M
+    high = np.max([f.max(axis=1) for f in rows], axis=0).clip(-REACH_M, REACH_M) + 2.0 * CELL_M
     shape = np.ceil((high - low) / CELL_M).astype(np.int64) + 1
-    grids = [_Cells(frame, low, shape) for frame in frames]
+    grids = [_Cells(columns, low, shape) for columns in rows]
     return tuple(grid.left_by([other.taken for other in grids if other is not grid]) for grid in grids)
 
 
 class _Cells:
-    """A frame's points within reach, the cell of each, and all cells that hold any of them or nearly do."""
+    """A frame's points (3, N) within reach, the cell of each, and all cells that hold any of them or nearly do."""
 
-    def __init__(self, frame: NDArray[np.floating[Any]], low: FloatArray, shape: IntArray) -> None:
+    def __init__(self, columns: NDArray[np.floating[Any]], low: FloatArray, shape: IntArray) -> None:
         strides = np.array([shape[1] * shape[2], shape[2], 1], dtype=np.int32)
-        columns = np.ascontiguousarray(frame.T, dtype=np.float32)
+        columns = columns.astype(np.float32, copy=False)
         near = np.abs(columns) < REACH_M
         self.index = np.flatnonzero(near[0] & near[1] & near[2])
         scaled = columns.take(self.index, axis=1)
@@ -52,6 +56,11 @@ class _Cells:
         self.cell = strides @ scaled.astype(np.int32)
         self.taken: BoolArray = np.zeros(int(np.prod(shape)), dtype=bool)
         slack = np.float32(SLACK_M / CELL_M)
+        if pays(SAVED_S_PER_POINT * len(self.index)):
+            from lidarpose.detect.target_kernels import mark_cells
+
+            mark_cells(scaled, slack, strides, self.taken)
+            return
         ends = [(scaled + step).astype(np.int32) * strides[:, None] for step in (-slack, slack)]
         for x in ends:
             for y in ends:

@@ -328,8 +328,9 @@ def in_outline(points: FloatArray, outline: FloatArray, normal: FloatArray, slac
 
 def _edges(outline: FloatArray, normal: FloatArray, slack_m: float) -> tuple[FloatArray, FloatArray]:
     """Unit directions (E, 3) inward from an outline's edges, and how far along each its points lie at least (E,)."""
-    edges = np.roll(outline, -1, axis=0) - outline
-    inward = np.cross(normal, edges)
+    x, y, z = (np.concatenate([outline[1:], outline[:1]]) - outline).T
+    a, b, c = normal
+    inward = np.column_stack([b * z - c * y, c * x - a * z, a * y - b * x])
     length = np.linalg.norm(inward, axis=1)
     keep = length > 1e-9
     inward = inward[keep] / length[keep, None]
