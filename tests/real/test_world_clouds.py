@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
-from lidarpose.detect.trihedral_corner import find_corners
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.rings import crossing_of_points
 from lidarpose.model.cloud import Cloud
@@ -17,7 +16,7 @@ from lidarpose.refine.corner_model import FreeCorner, frame_corners
 from lidarpose.storage.clouds import read_cloud
 from lidarpose.storage.corner_session import FileCloud
 from lidarpose.storage.packets import read_packets
-from lidarpose.workflows.corner_target import PlaceCrop, fit_place, mask_of, place_corners, select_faces
+from lidarpose.workflows.corner_target import LOOKS, PlaceCrop, fit_place, mask_of, place_corners, select_faces
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 
@@ -96,20 +95,26 @@ def test_the_clouds_themselves_tell_whether_beams_were_put_to_where_they_start()
 
 def found_planes(points: FloatArray, seed: int = 0) -> tuple[PlanePatch, ...]:
     """The largest first."""
-    patches = segment_planes(points, PlaneSearch(from_sensor=True, seed=seed))
+    patches = segment_planes(points, PlaneSearch(from_sensor=True, seed=seed, bent=True))
     return tuple(sorted(patches, key=len, reverse=True))
 
 
-def has_room_corner(points: FloatArray, patches: tuple[PlanePatch, ...]) -> bool:
-    return any(not c.convex and c.support > 100 for c in find_corners(points, patches))
+def has_room_corner(points: FloatArray, seed: int = 0) -> bool:
+    """As the world job looks for corners: again, with another draw of samples, where it finds none."""
+    place = CornerPlace("room", np.zeros(3), (MemoryCloud("room", Cloud(points.astype(np.float32))),))
+    looks = (place_corners(place, seed + attempt) for attempt in range(LOOKS))
+    return any(not c.convex and c.support > 100 for found in looks for c in found)
 
 
-def directions_met(patches: tuple[PlanePatch, ...]) -> set[tuple[int, int]]:
-    """Which of the frame's six directions some patch faces within 6 degrees, as axis and sign."""
-    normals = np.stack([p.plane.normal for p in patches])
-    axis = np.argmax(np.abs(normals), axis=1)
-    along = normals[np.arange(len(normals)), axis]
-    return {(int(a), int(np.sign(v))) for a, v in zip(axis, along, strict=True) if abs(v) > np.cos(np.radians(6.0))}
+def largest_by_direction(patches: tuple[PlanePatch, ...]) -> dict[tuple[int, int], PlanePatch]:
+    """Of patches, the largest first: the first that faces each of the frame's six directions within 6 degrees."""
+    found: dict[tuple[int, int], PlanePatch] = {}
+    for patch in patches:
+        axis = int(np.argmax(np.abs(patch.plane.normal)))
+        along = patch.plane.normal[axis]
+        if abs(along) > np.cos(np.radians(6.0)):
+            found.setdefault((axis, int(np.sign(along))), patch)
+    return found
 
 
 def test_a_corridor_from_a_tilted_2d_scanner() -> None:
@@ -118,16 +123,15 @@ def test_a_corridor_from_a_tilted_2d_scanner() -> None:
     points = rows[:, [2, 0, 1]] * [0.01, -0.01, 0.01]
     ranges = np.linalg.norm(points, axis=1)
     points = points[(ranges > 0.5) & (ranges < 30.0)]
-    for seed in range(2):
+    for seed in range(3):
         patches = found_planes(points, seed)
+        surfaces = largest_by_direction(patches[:8])
         # Floor, ceiling and both long walls.
-        assert {(2, 1), (2, -1), (1, 1), (1, -1)} <= directions_met(patches[:8])
-        off = off_square_deg(patches[:5])
-        assert np.median(off) < 1.1
-        # The floor within 2 m of the scanner leans by 2.6 degrees against the floor farther on.
-        near = [k for k, p in enumerate(patches[:5]) if np.median(np.linalg.norm(points[p.indices], axis=1)) < 0.9]
-        assert off_square_deg(tuple(p for k, p in enumerate(patches[:5]) if k not in near)).max() < 2.0
-        assert has_room_corner(points, patches)
+        assert {(2, 1), (2, -1), (1, 1), (1, -1)} <= set(surfaces)
+        assert np.median(off_square_deg(patches[:5])) < 1.0
+        # The floor within 2 m of the scanner leans by 4 degrees: sweeps were lost (see test_spun_scanners.py).
+        assert off_square_deg(tuple(surfaces[d] for d in ((2, -1), (1, 1), (1, -1)))).max() < 2.0
+        assert has_room_corner(points, seed)
 
 
 def room() -> FloatArray:
@@ -140,11 +144,11 @@ def test_a_room_from_a_rotating_2d_scanner() -> None:
     for seed in range(2):
         patches = found_planes(points, seed)
         assert all(np.median(np.linalg.norm(points[p.indices], axis=1)) > 1.0 for p in patches[:12])
-        assert {(2, 1), (2, -1), (1, 1), (1, -1)} <= directions_met(patches[:8])
+        assert {(2, 1), (2, -1), (1, 1), (1, -1)} <= set(largest_by_direction(patches[:8]))
         off = off_square_deg(patches[:5])
         assert np.median(off) < 1.6
         assert off.max() < 3.0
-        assert has_room_corner(points, patches)
+        assert has_room_corner(points, seed)
 
 
 def test_two_walls_and_the_floor_before_a_vlp_16() -> None:
@@ -152,6 +156,6 @@ def test_two_walls_and_the_floor_before_a_vlp_16() -> None:
     first = next(read_packets(folder("pcaps") / "sample_velodyne_vlp16_gps.pcap")).finite().points.astype(np.float64)
     points = first[np.linalg.norm(first, axis=1) > 0.1]
     patches = found_planes(points)
-    assert {(0, 1), (1, 1), (1, -1), (2, 1)} <= directions_met(patches[:8])
+    assert {(0, 1), (1, 1), (1, -1), (2, 1)} <= set(largest_by_direction(patches[:8]))
     assert off_square_deg(patches[:2]).max() < 0.5
     assert off_square_deg(patches[:6]).max() < 1.0

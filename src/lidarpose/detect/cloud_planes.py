@@ -54,6 +54,8 @@ GATE_SIGMAS = 3.0
 MIN_SIGMA_M = 2e-4
 # A patch spreads more than its neighbourhoods say, by up to this factor; a wider slab would take in two surfaces.
 WIDEST = 3.0
+# Patches that spread by this factor more than neighbouring points are of bent surfaces.
+BENT = 1.8
 # Of the voxels within twice a patch's thickness, the share that lies within it; and its thickness over its width.
 STANDS_OUT = 0.7
 THIN = 0.15
@@ -83,6 +85,10 @@ class PlaneSearch:
         LiDAR lies in one.
     hypotheses
         Planes tried on each subsample.
+    bent
+        Surfaces that are not flat to the noise, as of most buildings and of clouds put together a little wrong, are
+        wanted whole. Where the patches found spread much more than neighbouring points do, the search begins again at
+        their own scale. Without it they come in pieces, each as flat as neighbours are.
     """
 
     max_planes: int = 40
@@ -92,6 +98,7 @@ class PlaneSearch:
     from_sensor: bool = False
     seed: int = 0
     hypotheses: int = HYPOTHESES
+    bent: bool = False
 
 
 @dataclass(eq=False)
@@ -147,20 +154,26 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
     patches: list[PlanePatch] = []
     sigma_m: float | None = None
     ahead = Ahead.where_it_pays(x) if len(x) > DENSE else None
+    settled = not search.bent
     for _ in range(search.max_rounds):
         at_most = search.max_planes - len(patches)
         count = int(np.count_nonzero(free))
         if count < max(least, POINTS_PER_HYPOTHESIS) or at_most <= 0:
             break
         if count > DENSE:
-            found = _harvest_dense(x, free, count, sigma_m, search, least, at_most, rng, ahead)
+            found, near_m = _harvest_dense(x, free, count, sigma_m, search, least, at_most, rng, ahead)
         else:
             x = np.ascontiguousarray(x, dtype=np.float32)
             sample = _draw(x, np.flatnonzero(free), sigma_m, search, rng)
             sample.seeds = None
-            found = _harvest(x, free, sample, least, at_most)
+            found, near_m = _harvest(x, free, sample, least, at_most), sample.sigma_m
         if not found:
             break
+        if not settled and _typical_spread(found) > BENT * near_m:
+            settled, sigma_m = True, _typical_spread(found)
+            free[:] = True
+            continue
+        settled = True
         patches += found
         sigma_m = float(np.median([p.sigma_m for p in patches]))
     return tuple(patches)
@@ -176,9 +189,9 @@ def _harvest_dense(
     at_most: int,
     rng: np.random.Generator,
     ahead: Ahead | None,
-) -> list[PlanePatch]:
+) -> tuple[list[PlanePatch], float]:
     """Patches of the `count` free points of a cloud so dense that a subsample shows them; the whole cloud is asked
-    once for all of them."""
+    once for all of them. With them the spread of neighbouring points."""
     chosen = _one_of_each(count, DENSE_SAMPLE, rng)
     if count < len(x):
         chosen = np.flatnonzero(free)[chosen]
@@ -192,7 +205,7 @@ def _harvest_dense(
     seen = _harvest(few, np.ones(len(few), dtype=bool), sample, fewest, at_most)
     slabs = [Slab.around(few[p.indices], p.plane, p.sigma_m) for p in seen]
     if not slabs:
-        return []
+        return [], sample.sigma_m
     found = []
     among = None if count == len(x) else free
     claims = patches_of_slabs(x, among, slabs, WIDEST * sample.sigma_m, ahead)
@@ -211,7 +224,15 @@ def _harvest_dense(
     if len(found) < at_most:
         for patch in found:
             free[patch.indices] = False
-    return found
+    return found, sample.sigma_m
+
+
+def _typical_spread(patches: list[PlanePatch]) -> float:
+    """The spread of the patches that half of the points on any have at least."""
+    spread = np.array([p.sigma_m for p in patches])
+    order = np.argsort(spread)
+    points = np.cumsum([len(patches[k]) for k in order])
+    return float(spread[order[np.searchsorted(points, 0.5 * points[-1])]])
 
 
 def _one_of_each(count: int, parts: int, rng: np.random.Generator) -> IntArray:

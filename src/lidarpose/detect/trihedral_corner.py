@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, cross3, perpendicular_pair
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, cross3, perpendicular_pair, unit
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.planes import Plane, intersect_three_planes
 from lidarpose.model.corner_result import CornerCandidate
@@ -104,8 +104,10 @@ def _candidate(surfaces: list[_Surface], triple: IntArray, corner: FloatArray) -
         local.append(around)
     distances = [np.linalg.norm(p - corner, axis=1) for p in local]
     reach = min(float(np.quantile(d, 0.98)) for d in distances)
-    near = [_next_to_corner(p, d, reach) for p, d in zip(local, distances, strict=True)]
-    convex = _common_side(near, faces)
+    convex = _common_side(_next_to_corner(local, distances, reach), faces)
+    if convex is None:
+        # A face may go on past a narrow one, as the floor does past the side of a niche.
+        convex = _common_side(_next_to_corner(local, distances, _narrowest_m(local, faces, corner)), faces)
     if convex is None:
         return None
     # No farther from the corner than the smallest face reaches: a wall's or the ground's rest is no target.
@@ -146,10 +148,19 @@ def _common_side(local: list[FloatArray], faces: list[PlanePatch]) -> bool | Non
     return convex[0] if len(set(convex)) == 1 else None
 
 
-def _next_to_corner(points: FloatArray, distance: FloatArray, reach_m: float) -> FloatArray:
+def _narrowest_m(local: list[FloatArray], faces: list[PlanePatch], corner: FloatArray) -> float:
+    """How far the faces reach from the corner along each of their common edges: the least of it."""
+    reach = []
+    for a, b in combinations(range(3), 2):
+        edge = unit(cross3(faces[a].plane.normal, faces[b].plane.normal))
+        reach += [float(np.quantile(np.abs((local[k] - corner) @ edge), 0.98)) for k in (a, b)]
+    return min(reach)
+
+
+def _next_to_corner(local: list[FloatArray], distances: list[FloatArray], reach_m: float) -> list[FloatArray]:
     """The points that tell how the faces meet: farther out, a face's plane may go on behind another face."""
-    close = points[distance <= 0.7 * reach_m]
-    return np.asarray(close) if len(close) >= MIN_FACE_POINTS else points
+    close = [p[d <= 0.7 * reach_m] for p, d in zip(local, distances, strict=True)]
+    return [c if len(c) >= MIN_FACE_POINTS else p for c, p in zip(close, local, strict=True)]
 
 
 def _on_its_side(points: FloatArray, face: int, faces: list[PlanePatch], convex: bool) -> FloatArray:
