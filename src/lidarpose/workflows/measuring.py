@@ -159,7 +159,7 @@ def measure_planes(view: MeasuringView, *, least_share: float = 0.002, seed: int
     """
     points = view.beams.points.reshape(-1, 3)
     points = points[np.isfinite(points[:, 0])]
-    patches = segment_planes(points, PlaneSearch(min_points=60, min_share=least_share, seed=seed))
+    patches = segment_planes(points, PlaneSearch(min_points=60, min_share=least_share, seed=seed, bent=True))
     planes = joined_planes([points[p.indices] for p in patches], view.noise_m)
     if not planes:
         raise UndeterminedError(
