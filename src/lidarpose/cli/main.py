@@ -120,4 +120,7 @@ def _complain(message: str, *, status: int, hint: str | None = None) -> int:
 def main() -> None:
     """Console script."""
     gc.set_threshold(_GARBAGE_THRESHOLD)
-    sys.exit(run())
+    status = run()
+    # The interpreter searches all objects for garbage once more as it ends: a fifth of the start, for nothing.
+    gc.freeze()
+    sys.exit(status)

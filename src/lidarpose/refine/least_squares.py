@@ -50,6 +50,10 @@ def line_moments(columns: FloatArray, weight: FloatArray, start: IntArray) -> Fl
     `weight` (N,); `start` (S + 1,) tells where lines begin.
     """
     rows = np.sqrt(weight)[:, None] * columns
+    count = np.diff(start)
+    if len(count) and np.all(count == count[0]):
+        blocks = rows.reshape(len(count), int(count[0]), rows.shape[1])
+        return np.asarray(np.matmul(blocks.swapaxes(1, 2), blocks))
     out = np.empty((len(start) - 1, rows.shape[1], rows.shape[1]))
     begin = start.tolist()
     for j in range(len(out)):

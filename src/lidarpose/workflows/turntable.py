@@ -244,9 +244,11 @@ def doubted(quality: Quality | None, features: DetectedFeatures, observations: T
 
 
 def _import_what_follows() -> None:
-    """Modules that the job needs once its images are searched."""
-    for name in ("solve.assignment", "solve.paper", "refine.turntable"):
-        import_module(f"lidarpose.{name}")
+    """Modules that the job needs once its images are searched, and what is computed once a process."""
+    # numpy.median imports numpy.ma when it is called first.
+    for name in ("lidarpose.solve.assignment", "lidarpose.solve.paper", "lidarpose.refine.turntable", "numpy.ma"):
+        import_module(name)
+    import_module("lidarpose.refine.noise").gaussian_moments()
 
 
 def detect_features(
