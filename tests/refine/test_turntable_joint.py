@@ -124,6 +124,28 @@ def test_a_part_that_whole_lines_share_is_found_and_paid_for() -> None:
     assert np.mean(square) < 9.0
 
 
+def test_ranges_that_resemble_their_neighbours_are_not_counted_in_full() -> None:
+    rig = draw_rig(1, places=8)
+    middle = float(rig.turntable_angle_rad.mean())
+    square = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        observations = simulate_observations(rig, range_sigma_m=0.0, stripe_step_px=12.0, seed=seed)
+        places = []
+        for p in observations.places:
+            lines = {}
+            for k, line in p.scan_lines.items():
+                noise = np.convolve(rng.standard_normal(len(line) + 3), np.full(4, 0.5), "valid")
+                lines[k] = replace(line, range_m=line.range_m + 1e-3 * noise, sigma_m=np.full(len(line), 1e-3))
+            places.append(replace(p, scan_lines=lines))
+        estimate = refine(rig, replace(observations, places=tuple(places)))
+        assert estimate.noise["ranges"].rows_as_one == pytest.approx(4.0, rel=0.3)
+        assert estimate.noise["ranges"].sigma == pytest.approx(1e-3, rel=0.1)
+        square.append(errors(estimate, rig, middle)[2])
+    # Mean of 10 chi-squares of 6 degrees of freedom: 6 with a standard deviation of 1.1.
+    assert 2.7 < np.mean(square) < 9.3
+
+
 def test_boards_and_scans_alone_are_enough() -> None:
     rig = draw_rig(3, family="paper", placements=3, places=20)
     observations = simulate_observations(rig, with_stripe=False, seed=2)

@@ -36,10 +36,13 @@ class NoiseEstimate:
         Standard deviation of what a whole line (a stripe or a scan line at one place) is off by beyond that scatter;
         0 where the data show no such part.
     neighbour_factor
-        Variance inflation because what a line (or corner) is off by resembles that of its neighbours; 1 where it
-        does not.
+        Variance inflation because what a line (or corner) is off by resembles that of its neighbours, and because the
+        variance of whole lines was estimated from few; 1 where neither is so.
     redundancy
         Measurements less the parameters they paid for.
+    rows_as_one
+        How many neighbouring measurements of a line are worth one, since their errors resemble each other; 1 where they
+        do not.
     """
 
     count: int
@@ -50,6 +53,7 @@ class NoiseEstimate:
     place_sigma: float
     redundancy: float
     neighbour_factor: float = 1.0
+    rows_as_one: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,10 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.observation import PanelCorners
 from lidarpose.model.turntable_result import Kind
+from lidarpose.refine.least_squares import own_effects
 from lidarpose.refine.turntable_layout import JointData
 from lidarpose.refine.turntable_parameters import N_MOTION
 
@@ -50,7 +51,7 @@ def drift(data: JointData, moments: Mapping[Kind, FloatArray], line_weights: Map
     smooth = smooth_count = 0.0
     for kind, m in moments.items():
         lines = data.stripes.lines if kind == "stripes" else data.ranges.lines
-        own, good = _own_effects(m)
+        own, good = own_effects(m)
         good &= line_weights[kind] > 0.5
         for slot in np.unique(lines.slot):
             mine = good & (lines.slot == slot)
@@ -74,15 +75,6 @@ def _smooth_against_rest(effects: FloatArray, angles: FloatArray) -> FloatArray:
     left = effects - Q @ explained
     scale = (left**2).sum(axis=0) / max(len(x) - _SMOOTH_TERMS, 1)
     return np.asarray((explained**2).sum(axis=0) / np.maximum(scale, 1e-300))
-
-
-def _own_effects(moments: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Least-squares shift and slope (S, 2) of each line, and where there is one."""
-    size = moments.shape[1]
-    inner = moments[:, size - 3 : size - 1, size - 3 : size - 1]
-    good = np.linalg.det(inner) > 1e-12 * np.maximum(inner[:, 0, 0], 1e-300) ** 2
-    inverse = np.linalg.inv(np.where(good[:, None, None], inner, np.eye(2)))
-    return (inverse @ moments[:, size - 3 : size - 1, -1:])[:, :, 0], np.asarray(good)
 
 
 class _Residuals(Protocol):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 
 SQRT3 = float(np.sqrt(3.0))
 
@@ -60,6 +60,15 @@ def line_moments(columns: FloatArray, weight: FloatArray, start: IntArray) -> Fl
         block = rows[begin[j] : begin[j + 1]]
         np.dot(block.T, block, out=out[j])
     return out
+
+
+def own_effects(moments: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Least-squares shift and slope (S, 2) of each line by itself, and where there is one."""
+    size = moments.shape[1]
+    inner = moments[:, size - 3 : size - 1, size - 3 : size - 1]
+    good = np.linalg.det(inner) > 1e-12 * np.maximum(inner[:, 0, 0], 1e-300) ** 2
+    inverse = np.linalg.inv(np.where(good[:, None, None], inner, np.eye(2)))
+    return (inverse @ moments[:, size - 3 : size - 1, -1:])[:, :, 0], np.asarray(good)
 
 
 @dataclass(frozen=True, eq=False)

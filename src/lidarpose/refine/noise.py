@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.robust import mad_sigma
 
 CORE = 2.5
@@ -77,3 +77,70 @@ def information_correction(standardised: FloatArray, weight: FloatArray) -> floa
     if square <= 0.0 or bend <= 0.1:
         return 1.0
     return float(np.clip(bend**2 / (square * mean_weight), 0.3, 1.0))
+
+
+_SURE_LAG = 2.0
+"""A correlation below so many of its standard deviations ends the sum over lags."""
+_MOST_LAGS = 60
+
+
+def rows_that_count_as_one(psi: FloatArray, line_of_row: IntArray, parameters: float) -> float:
+    """How many neighbouring measurements of a line are worth one, at least 1.
+
+    The variance of a mean of correlated rows exceeds that of independent ones by 1 + 2 (rho_1 + rho_2 + ...) (Bartlett,
+    1946). The sum ends at the first lag whose correlation is not significant. A line of hundreds of rows has enough of
+    them to tell this even where lines are few.
+
+    Parameters
+    ----------
+    psi : (N,)
+        Weighted standardised residuals, row after row of each line; zero where a row is not used.
+    line_of_row : (N,)
+    parameters
+        Degrees of freedom that were taken from the rows: they alone make residuals correlate by minus their share.
+    """
+    used = psi != 0.0
+    n = int(np.count_nonzero(used))
+    if n <= 2.0 * parameters:
+        return 1.0
+    square = float(psi @ psi) / n
+    taken = parameters / (n - parameters)
+    total = 0.0
+    for lag in range(1, min(_MOST_LAGS, len(psi) - 1) + 1):
+        pairs = used[lag:] & used[:-lag] & (line_of_row[lag:] == line_of_row[:-lag])
+        count = int(np.count_nonzero(pairs))
+        if count < 20:
+            break
+        correlation = float(psi[lag:][pairs] @ psi[:-lag][pairs]) / count / square + taken
+        if correlation < _SURE_LAG / np.sqrt(count):
+            break
+        total += correlation
+    return 1.0 + 2.0 * total
+
+
+_SCATTER_BINS = 8
+_LEAST_PER_BIN = 25
+_SURE_GROWTH = 3.0
+
+
+def growth_of_scatter(standardised: FloatArray, sigma: FloatArray) -> float:
+    """The exponent p for which scatter grows as sigma^p, sigma being stated with each measurement; 1 if they are right.
+
+    Stated standard deviations are only as good as what detection knows of the noise: where they run from 1 to 5, the
+    true ones may run from 1 to 2. Slope of log scatter against log sigma over bins of equal size; 1 unless it differs
+    by three standard deviations, and where all sigmas are much the same.
+    """
+    bins = min(_SCATTER_BINS, len(sigma) // _LEAST_PER_BIN)
+    if bins < 3:
+        return 1.0
+    size = len(sigma) // bins
+    order = np.argsort(sigma, kind="stable")[: bins * size].reshape(bins, size)
+    x = np.log(sigma[order]).mean(axis=1)
+    x = x - x.mean()
+    if float(np.ptp(x)) < 0.2:
+        return 1.0
+    scatter = np.array([mad_sigma(standardised[row], centred=True) for row in order])
+    slope = float(x @ np.log(np.maximum(scatter, 1e-12)) / (x @ x))
+    # A median absolute deviation of n normal numbers has a relative standard deviation of 1.17 / sqrt(n).
+    doubt = 1.17 / np.sqrt(size * float(x @ x))
+    return float(np.clip(1.0 + slope, 0.0, 2.0)) if abs(slope) > _SURE_GROWTH * doubt else 1.0

@@ -117,6 +117,7 @@ def noise_estimates(solution: Solution) -> dict[Kind, NoiseEstimate]:
             float(np.sqrt(of_lines.place_variance)),
             max(used - 10.0, 0.0),
             of_lines.neighbour_factor,
+            of_lines.rows_as_one,
         )
     return out
 

@@ -26,10 +26,17 @@ from lidarpose.refine.least_squares import (
     add_lines,
     covariance_and_condition,
     line_moments,
+    own_effects,
     take_out_effects,
 )
-from lidarpose.refine.noise import information_correction, robust_scale, taper_weights
-from lidarpose.refine.place_effects import place_variance
+from lidarpose.refine.noise import (
+    growth_of_scatter,
+    information_correction,
+    robust_scale,
+    rows_that_count_as_one,
+    taper_weights,
+)
+from lidarpose.refine.place_effects import PlaceEffects, place_effects
 from lidarpose.refine.turntable_layout import JointData, Lines, thinned
 from lidarpose.refine.turntable_parameters import CAMERA_EXTRAS, EXTRAS, N_GLOBAL, N_MOTION
 from lidarpose.refine.turntable_residuals import (
@@ -47,7 +54,11 @@ Moments = dict[Kind, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class LineNoise:
-    """Noise of one kind of lines: factor on the stated sigma, variance of a line's shift and slope, weights."""
+    """Noise of one kind of lines: factor on the stated sigma, variance of a line's shift and slope, weights.
+
+    `rows_as_one`: how many neighbouring rows are worth one. `certainty_factor`: what the variance of whole lines costs
+    for being estimated from few of them, see `PlaceEffects`.
+    """
 
     factor: float
     place_variance: float
@@ -55,16 +66,20 @@ class LineNoise:
     line_weights: FloatArray
     correction: float = 1.0
     neighbour_factor: float = 1.0
+    rows_as_one: float = 1.0
+    certainty_factor: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class CornerNoise:
-    """Noise of corners: factor on the stated sigma, weights, and how far smooth parts of the residuals exceed it."""
+    """Noise of corners: factor on the stated sigma, weights, how far smooth parts of the residuals exceed it, and the
+    standard deviations of what all corners of a panel are off by together (`JointData.common_corner_modes`)."""
 
     factor: float
     weights: tuple[FloatArray, ...]
     correction: float = 1.0
     smooth_factor: float = 1.0
+    common_sigmas_px: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +156,10 @@ def solve_joint(data: JointData, start: JointState, options: JointOptions) -> So
     _require_enough(data)
     active = active_parameters(data, options.estimate)
     solution = _solve(data, start, active, options.max_iterations, with_places=True)
-    sharp = replace(solution.noise, corners=replace(solution.noise.corners, smooth_factor=1.0))
+    sharp = Noise(
+        replace(solution.noise.corners, smooth_factor=1.0, common_sigmas_px=()),
+        {kind: replace(n, rows_as_one=1.0) for kind, n in solution.noise.lines.items()},
+    )
     plain = _finish(data, solution.at, sharp, active, solution.iterations, solution.converged, pay=False)
     if solution.drift is None or solution.drift.ratio < _NOT_RANDOM:
         return replace(solution, suspicious=plain)
@@ -162,15 +180,18 @@ def at_stated_noise(data: JointData, state: JointState) -> Solution:
         kind: LineNoise(1.0, 0.0, np.ones(len(r.residual)), np.ones(lines_of(data, kind).count))
         for kind, r in at.lines.items()
     }
-    corners = CornerNoise(1.0, tuple(np.ones(len(c.residual)) for c in at.corners))
+    corners = CornerNoise(
+        1.0, tuple(np.ones(len(c.residual)) for c in at.corners), common_sigmas_px=COMMON_CORNER_SIGMAS_PX
+    )
     active = active_parameters(data, ())
     return _finish(data, at, Noise(corners, lines), active, 0, True, pay=False)
 
 
-COMMON_CORNER_SIGMA_PX = 0.001
-"""What the corners of a panel are off by together, which no residual shows: residuals of neighbouring corners are not
-even correlated (-0.08). Against the truth, 40 rendered panels on which nothing was tuned (seeds 200 to 219) are
-off together by 0.0012 px an axis, where their scatter alone would leave 0.0008 px."""
+COMMON_CORNER_SIGMAS_PX = (0.0016, 0.0016, 0.0009)
+"""What all corners of a panel are off by together: in x, in y, and away from the middle (root mean square). It looks
+like a board elsewhere, so no residual shows it. Measured against the truth on 946 rendered panels (images of 1100 to
+1624 px, corners that scatter by 0.014 px); a turn in the image and a stretch along one diagonal show nothing beyond
+scatter. 0.7 of the shift is the same in all placements of a session."""
 _COARSE_ROWS = 32
 _NOT_RANDOM = 8.0
 
@@ -180,14 +201,43 @@ def _solve(data: JointData, start: JointState, active: IntArray, max_iterations:
     state, spent, earlier = start, 0, None
     if rows > 4 * _COARSE_ROWS * (data.stripes.lines.count + data.ranges.lines.count):
         # Most of the way on few rows of each line; the last steps on all of them.
-        coarse = _iterate(thinned(data, _COARSE_ROWS), start, active, max_iterations, None, with_places)
+        few = thinned(data, _COARSE_ROWS)
+        coarse = _iterate(few, start, active, max_iterations, None, with_places)
         state, spent, earlier = coarse.at.state, coarse.iterations, coarse.noise
+        data = _with_growth(data, _growth(few, coarse))
     done = _iterate(data, state, active, max_iterations, earlier, with_places)
+    if earlier is None:
+        growth = _growth(data, done)
+        if any(power != 1.0 for power in growth.values()):
+            data, spent = _with_growth(data, growth), done.iterations
+            done = _iterate(data, done.at.state, active, max_iterations, done.noise, with_places)
     noise = done.noise
     if not with_places:
         moments = all_moments(data, done.at, noise)
         noise = update_noise(data, done.at, noise, moments, active, soft=False, with_places=True)
     return _finish(data, done.at, noise, active, spent + done.iterations, done.converged)
+
+
+def _growth(data: JointData, done: _Progress) -> dict[Kind, float]:
+    """By kind, the power of the stated standard deviations with which scatter grows."""
+    found: dict[Kind, float] = {}
+    for kind, residuals in done.at.lines.items():
+        lines, noise = lines_of(data, kind), done.noise.lines[kind]
+        moments = line_moments(residuals.columns, _row_weight(lines, residuals, noise), lines.start)
+        _, effects = take_out_effects(moments, noise.place_variance)
+        use = residuals.valid & (noise.line_weights[lines.line_of_row] > 0.0) & (noise.row_weights > 0.0)
+        z = _without_effects(lines, residuals, effects)[use] / (lines.sigma[use] * noise.factor)
+        found[kind] = growth_of_scatter(z, lines.sigma[use])
+    return found
+
+
+def _with_growth(data: JointData, growth: Mapping[Kind, float]) -> JointData:
+    stripes, ranges = data.stripes, data.ranges
+    return replace(
+        data,
+        stripes=replace(stripes, lines=stripes.lines.with_growth(growth.get("stripes", 1.0))),
+        ranges=replace(ranges, lines=ranges.lines.with_growth(growth.get("ranges", 1.0))),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +325,9 @@ def _damped_step(
 
 
 def _row_weight(lines: Lines, residuals: LineResiduals, noise: LineNoise) -> FloatArray:
-    return np.asarray(np.where(residuals.valid, noise.row_weights / (lines.sigma * noise.factor) ** 2, 0.0))
+    return np.asarray(
+        np.where(residuals.valid, noise.row_weights / (noise.rows_as_one * (lines.sigma * noise.factor) ** 2), 0.0)
+    )
 
 
 def all_moments(data: JointData, at: Linearised, noise: Noise) -> Moments:
@@ -299,16 +351,44 @@ def _corner_weight(data: JointData, noise: CornerNoise, k: int) -> FloatArray:
     return np.asarray(noise.weights[k] * noise.correction / (noise.smooth_factor * (sigma * noise.factor) ** 2))
 
 
+def _add_corners(
+    data: JointData, at: Linearised, noise: CornerNoise, into: tuple[FloatArray, FloatArray] | None = None
+) -> float:
+    """Add corners' normal equations to (information, gradient), if given; return their weighted sum of squares.
+
+    What all corners of a panel are off by together, the same in all of its placements, is integrated out.
+    """
+    n, total = N_GLOBAL + 6 * len(data.slots), 0.0
+    shared = {slot.panel: (np.zeros((n, 3)), np.zeros((3, 3)), np.zeros(3)) for slot in data.slots}
+    for k, (slot, corner) in enumerate(zip(data.slots, at.corners, strict=True)):
+        weight = _corner_weight(data, noise, k)
+        coupling, own, pull = shared[slot.panel]
+        modes = weight[:, None] * data.common_corner_modes[k]
+        own += data.common_corner_modes[k].T @ modes
+        pull += modes.T @ corner.residual
+        total += float(weight @ corner.residual**2)
+        if into is not None:
+            information, gradient = into
+            columns = [*range(N_GLOBAL + 6 * k, N_GLOBAL + 6 * k + 6), *CAMERA_EXTRAS]
+            weighted = weight[:, None] * corner.jacobian
+            information[np.ix_(columns, columns)] += corner.jacobian.T @ weighted
+            gradient[columns] -= weighted.T @ corner.residual
+            coupling[columns] += corner.jacobian.T @ modes
+    if noise.common_sigmas_px:
+        for coupling, own, pull in shared.values():
+            shrink = np.linalg.inv(own + np.diag(1.0 / np.square(noise.common_sigmas_px)))
+            total -= float(pull @ shrink @ pull)
+            if into is not None:
+                into[0][...] -= coupling @ shrink @ coupling.T
+                into[1][...] += coupling @ shrink @ pull
+    return total
+
+
 def normal_equations(data: JointData, at: Linearised, noise: Noise, moments: Moments) -> NormalEquations:
     """Of all parameters, active or not, at the noise as it is known."""
     n = N_GLOBAL + 6 * len(data.slots)
-    information, gradient, total = np.zeros((n, n)), np.zeros(n), 0.0
-    for k, corner in enumerate(at.corners):
-        weight = _corner_weight(data, noise.corners, k)
-        columns = [*range(N_GLOBAL + 6 * k, N_GLOBAL + 6 * k + 6), *CAMERA_EXTRAS]
-        information[np.ix_(columns, columns)] += corner.jacobian.T @ (weight[:, None] * corner.jacobian)
-        gradient[columns] -= corner.jacobian.T @ (weight * corner.residual)
-        total += float(weight @ corner.residual**2)
+    information, gradient = np.zeros((n, n)), np.zeros(n)
+    total = _add_corners(data, at, noise.corners, (information, gradient))
     for kind, residuals in at.lines.items():
         reduced = reduced_moments(moments[kind], noise.lines[kind])
         slot = lines_of(data, kind).slot
@@ -318,9 +398,7 @@ def normal_equations(data: JointData, at: Linearised, noise: Noise, moments: Mom
 
 def sum_of_squares(data: JointData, at: Linearised, noise: Noise, moments: Moments) -> float:
     """The weighted sum of squares alone, for accepting a step."""
-    total = 0.0
-    for k, corner in enumerate(at.corners):
-        total += float(_corner_weight(data, noise.corners, k) @ corner.residual**2)
+    total = _add_corners(data, at, noise.corners)
     for kind in at.lines:
         total += float(reduced_moments(moments[kind], noise.lines[kind])[:, -1, -1].sum())
     return total
@@ -378,7 +456,12 @@ def carried_over(data: JointData, at: Linearised, earlier: Noise) -> Noise:
 
 def _without_effects(lines: Lines, residuals: LineResiduals, effects: LineEffects) -> FloatArray:
     """Residuals (N,) less the predicted shift and slope of their lines."""
-    shift = effects.predicted[lines.line_of_row]
+    return _less(lines, residuals, effects.predicted)
+
+
+def _less(lines: Lines, residuals: LineResiduals, of_line: FloatArray) -> FloatArray:
+    """Residuals (N,) less a shift and a slope (S, 2) of their lines."""
+    shift = of_line[lines.line_of_row]
     return np.asarray(residuals.residual - shift[:, 0] - SQRT3 * lines.along * shift[:, 1])
 
 
@@ -422,10 +505,7 @@ def _update_corners(
         weights = huber_weights(together / factor)
     correction = 1.0 if soft else information_correction(together / factor, weights)
     cuts = np.cumsum([len(each) for each in z])[:-1]
-    sigma_px = factor * float(np.median(np.concatenate([c.sigma_px for c in data.corners])))
-    # What all corners of a panel share cannot be seen in their residuals; more corners do not average it away.
-    smooth = 1.0 + (len(together) / (2.0 * len(z))) * (COMMON_CORNER_SIGMA_PX / max(sigma_px, 1e-6)) ** 2
-    return CornerNoise(factor, tuple(np.split(weights, cuts)), correction, smooth)
+    return CornerNoise(factor, tuple(np.split(weights, cuts)), correction, 1.0, COMMON_CORNER_SIGMAS_PX)
 
 
 def _update_lines(
@@ -439,15 +519,16 @@ def _update_lines(
     with_places: bool,
 ) -> LineNoise:
     spread = _parameter_spread(residuals, lines, moments, covariance)
-    variance = 0.0
-    line_weights: FloatArray = np.ones(lines.count)
+    places = PlaceEffects(0.0, np.ones(lines.count))
     if with_places:
-        variance, line_weights = place_variance(moments, spread, noise.place_variance)
+        places = place_effects(moments, spread, noise.place_variance)
+    variance, line_weights = places.variance, places.weight
     reduced, effects = take_out_effects(moments, variance)
     own = _without_effects(lines, residuals, effects)
     use = residuals.valid & (line_weights[lines.line_of_row] > 0.0)
-    paid = float(np.einsum("sij,sij->", reduced[:, :-1, :-1], spread))
-    paid += _effect_freedom(effects, variance)
+    # Rows that say the same over again lose as much freedom as if each stood for itself.
+    paid = noise.rows_as_one * float(np.einsum("sij,sij->", reduced[:, :-1, :-1], spread))
+    paid += noise.rows_as_one * _effect_freedom(effects, variance)
     z = own / lines.sigma
     factor, used_weights = robust_scale(z[use], min(paid, 0.5 * use.sum()))
     factor = _floor(factor, kind, lines.sigma)
@@ -457,7 +538,12 @@ def _update_lines(
     # Full weights within a line that was dropped: whether it stays out must not depend on its being out.
     row_weights[dropped] = 1.0
     correction = 1.0 if soft else information_correction(z[use] / factor, used_weights)
-    return LineNoise(factor, variance, row_weights, line_weights, correction, noise.neighbour_factor)
+    by_line, good = own_effects(moments)
+    psi = np.where(use & good[lines.line_of_row], row_weights * _less(lines, residuals, by_line) / lines.sigma, 0.0)
+    as_one = rows_that_count_as_one(psi, lines.line_of_row, 2.0 * lines.count)
+    return LineNoise(
+        factor, variance, row_weights, line_weights, correction, noise.neighbour_factor, as_one, places.certainty_factor
+    )
 
 
 def _parameter_spread(
@@ -484,7 +570,7 @@ def _noise_change(a: Noise, b: Noise) -> float:
     change = abs(a.corners.factor / b.corners.factor - 1.0)
     for kind, old in a.lines.items():
         new = b.lines[kind]
-        change = max(change, abs(old.factor / new.factor - 1.0))
+        change = max(change, abs(old.factor / new.factor - 1.0), 0.1 * abs(old.rows_as_one / new.rows_as_one - 1.0))
         larger = max(old.place_variance, new.place_variance)
         if larger > 0.0:
             change = max(change, 0.1 * abs(old.place_variance - new.place_variance) / larger)
@@ -505,7 +591,8 @@ def _finish(
     moments = all_moments(data, at, noise)
     found = drift(data, moments, {kind: n.line_weights for kind, n in noise.lines.items()})
     factor = found.inflation if found is not None and pay else 1.0
-    noise = replace(noise, lines={k: replace(n, neighbour_factor=factor) for k, n in noise.lines.items()})
+    prices = {k: factor * (n.certainty_factor if pay else 1.0) for k, n in noise.lines.items()}
+    noise = replace(noise, lines={k: replace(n, neighbour_factor=prices[k]) for k, n in noise.lines.items()})
     if pay:
         # Bent corners are paid for in the covariance alone: with less weight they would let the panels drift away.
         bent = max(noise.corners.smooth_factor, smooth_factor(data.corners, at.corners))

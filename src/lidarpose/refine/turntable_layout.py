@@ -51,6 +51,14 @@ class Lines:
     def line_of_row(self) -> IntArray:
         return np.repeat(np.arange(self.count), np.diff(self.start))
 
+    def with_growth(self, exponent: float) -> Lines:
+        """The same with standard deviations that grow as this power of the stated ones; their median stays."""
+        finite = self.sigma[np.isfinite(self.sigma)]
+        if exponent == 1.0 or not len(finite):
+            return self
+        middle = float(np.median(finite))
+        return replace(self, sigma=middle * (self.sigma / middle) ** max(exponent, 1e-3))
+
 
 @dataclass(frozen=True, eq=False)
 class StripeRows:
@@ -109,6 +117,22 @@ class JointData:
     ranges: RangeRows
     has_intensity: bool
     left_out: tuple[LeftOut, ...]
+
+    @cached_property
+    def common_corner_modes(self) -> tuple[FloatArray, ...]:
+        """By slot, what all corners of a panel can be off by together (2N, 3): in x, in y, and away from the middle.
+
+        The first two are 1 where they are not 0, the third has a root mean square of 1.
+        """
+        return tuple(_common_modes(corners.pixels) for corners in self.corners)
+
+
+def _common_modes(pixels: FloatArray) -> FloatArray:
+    out = np.zeros((2 * len(pixels), 3))
+    out[0::2, 0] = out[1::2, 1] = 1.0
+    away = (pixels - pixels.mean(axis=0)).ravel()
+    out[:, 2] = away / np.sqrt((away**2).mean())
+    return out
 
 
 def lay_out(observations: TurntableObservations, *, use_stripes: bool = True) -> JointData:

@@ -191,6 +191,7 @@ def _figures(evidence: Evidence) -> dict[str, Any]:
                 "sigma": n.sigma * (1e3 if kind == "ranges" else 1.0),
                 "sigma_of_whole_lines": n.place_sigma * (1e3 if kind == "ranges" else 1.0),
                 "times_stated": n.factor,
+                "neighbours_worth_one": n.rows_as_one,
                 "used": n.used,
                 "offered": n.count,
             }

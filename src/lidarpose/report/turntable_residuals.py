@@ -97,6 +97,8 @@ def residual_histogram(estimate: TurntableEstimate, kind: Kind) -> Markup | None
     )
     if noise.place_sigma > 0.0:
         caption += f" Whole lines are off by a further {short(_SCALE[kind] * noise.place_sigma)} {unit}."
+    if noise.rows_as_one > 1.5:
+        caption += f" Neighbours resemble each other: {short(noise.rows_as_one)} are worth one."
     legend = [legend_key("box", "p1 mid", "measured"), legend_key("line", "ink", "expected")]
     return figure(KIND_WORDS[kind].capitalize(), draw, caption, legend, size="third")
 
