@@ -10,8 +10,8 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.observation import PanelCorners, PlaceObservation, ScanLine, TurntableObservations
 from lidarpose.model.turntable_result import TurntableEstimate
+from lidarpose.refine.joint_options import Start
 from lidarpose.refine.turntable import JointOptions, refine_turntable
-from lidarpose.refine.turntable_joint import Start
 from lidarpose.simulate.observations import Blunders, simulate_observations
 from lidarpose.simulate.rig import draw_rig
 from lidarpose.solve.paper import solve_paper
