@@ -4,11 +4,16 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from lidarpose.cli.main import run
+from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose, exp_so3
 from lidarpose.storage.calibration import read_world_calibration
+from lidarpose.storage.corner_session import read_corner_session
+from lidarpose.workflows.recorded_corners import with_scans
+from lidarpose.workflows.world import world_run
 
 # The carton stands on its tip, towards the camera; it is moved, never turned.
 SIZE_M = 0.4
@@ -30,26 +35,112 @@ centre_m = [0.0, 0.0, 3.5]
 """
 
 
-def test_recordings_and_their_calibration_give_the_cameras_pose(tmp_path: Path) -> None:
-    session = tmp_path / "session"
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session whose clouds are recordings, with the turntable's calibration beside it as turntable.json."""
+    base = tmp_path_factory.mktemp("recorded")
     rows = ["position,world_x_m,world_y_m,world_z_m,clouds"]
     for k, (corner, world) in enumerate(zip(CORNERS, T_WORLD_CAMERA @ CORNERS, strict=True)):
-        (tmp_path / "scene.toml").write_text(scene(corner))
-        recording, cloud = str(tmp_path / f"recording{k}"), session / f"clouds/p{k}/000.ply"
-        cloud.parent.mkdir(parents=True)
+        (base / "scene.toml").write_text(scene(corner))
+        recording = base / f"session/recordings/p{k}"
+        recording.parent.mkdir(parents=True, exist_ok=True)
         steps = ["--turntable-deg", "-22", "22", "--sweep-step-deg", "0.4", "--beam-step-deg", "0.3", "--seed", str(k)]
         steps += ["--range-sigma-m", "0.003"]
-        assert run(["simulate", "scene", str(tmp_path / "scene.toml"), recording, *steps]) == 0
-        assert run(["scan", recording, recording + ".calibration.json", "-o", str(cloud)]) == 0
-        rows.append(f"p{k}," + ",".join(f"{x:.6f}" for x in world) + f",clouds/p{k}/*.ply")
-    (session / "positions.csv").write_text("\n".join(rows) + "\n")
-    header = ['format = "lidarpose/corner-session@1"', 'positions = "positions.csv"', 'cloud_frame = "camera"']
-    (session / "session.toml").write_text("\n".join(header) + "\n")
-    assert run(["calibrate", str(session), "-o", str(tmp_path / "out")]) == 0
-    found = read_world_calibration(tmp_path / "out" / "calibration.json")
+        assert run(["simulate", "scene", str(base / "scene.toml"), str(recording), *steps]) == 0
+        (base / f"session/recordings/p{k}.calibration.json").replace(base / "turntable.json")
+        rows.append(f"p{k}," + ",".join(f"{x:.6f}" for x in world) + f",recordings/p{k}")
+    (base / "session/positions.csv").write_text("\n".join(rows) + "\n")
+    header = ['format = "lidarpose/corner-session@1"', 'positions = "positions.csv"']
+    (base / "session/session.toml").write_text("\n".join(header) + "\n")
+    return base
+
+
+def check(result: Path) -> None:
+    found = read_world_calibration(result / "calibration.json")
     metres, radians = found.T_world_source.distance(T_WORLD_CAMERA)
     assert metres < 0.002
     assert np.degrees(radians) < 0.06
-    document = json.loads((tmp_path / "out" / "calibration.json").read_text())
+    document = json.loads((result / "calibration.json").read_text())
     assert [(t["parent"], t["child"]) for t in document["transforms"]] == [("world", "camera")]
     assert document["quality"]["verdict"] == "good"
+
+
+def test_recordings_are_clouds_by_their_turntables_calibration(recorded: Path, tmp_path: Path) -> None:
+    session = recorded / "session"
+    turntable = ["--turntable", str(recorded / "turntable.json")]
+    assert run(["calibrate", str(session), "-o", str(tmp_path / "option"), *turntable]) == 0
+    check(tmp_path / "option")
+    # The same as from clouds that were scanned first.
+    clouds = tmp_path / "scanned"
+    clouds.mkdir()
+    table = (session / "positions.csv").read_text()
+    for k in range(len(CORNERS)):
+        cloud = clouds / f"p{k}.ply"
+        assert run(["scan", str(session / f"recordings/p{k}"), str(recorded / "turntable.json"), "-o", str(cloud)]) == 0
+        table = table.replace(f"recordings/p{k}", f"p{k}.ply")
+    (clouds / "positions.csv").write_text(table)
+    (clouds / "session.toml").write_text((session / "session.toml").read_text() + 'cloud_frame = "camera"\n')
+    assert run(["calibrate", str(clouds), "-o", str(tmp_path / "out")]) == 0
+    check(tmp_path / "out")
+    a, b = (read_world_calibration(tmp_path / name / "calibration.json") for name in ("option", "out"))
+    np.testing.assert_allclose(a.T_world_source.matrix, b.T_world_source.matrix, atol=1e-6)
+
+
+def test_a_session_names_the_calibration_of_its_turntable(recorded: Path) -> None:
+    session = read_corner_session(recorded / "session")
+    assert session.has_recordings
+    assert session.cloud_frame == "camera"
+    assert session.turntable is None
+    with pytest.raises(InputError, match="turntable_calibration"):
+        world_run(session)
+    file = recorded / "session/session.toml"
+    plain = file.read_text()
+    (recorded / "session/turntable.json").write_bytes((recorded / "turntable.json").read_bytes())
+    try:
+        file.write_text(plain + 'turntable_calibration = "turntable.json"\n')
+        named = with_scans(read_corner_session(recorded / "session"))
+        assert not named.has_recordings
+        points = named.places[0].clouds[0].load().points
+        assert np.linalg.norm(points - CORNERS[0], axis=1).min() < 0.03
+        file.write_text(plain + 'cloud_frame = "lidar"\n')
+        with pytest.raises(InputError, match="cloud_frame"):
+            read_corner_session(recorded / "session")
+    finally:
+        file.write_text(plain)
+
+
+def test_recordings_without_a_calibration_are_named(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["calibrate", str(recorded / "session"), "-o", str(tmp_path / "out")]) == 2
+    assert "--turntable" in capsys.readouterr().err
+    assert run(["inspect", str(recorded / "session")]) == 0
+    assert "turntable_calibration" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "pattern", ["recordings/p1", "recordings/p1/", "recordings/p1/*", "recordings/p1/recording.toml"]
+)
+def test_a_recording_is_found_by_its_folder_or_its_files(recorded: Path, pattern: str) -> None:
+    table = recorded / "session/positions.csv"
+    plain = table.read_text()
+    try:
+        table.write_text(plain.replace("recordings/p1\n", pattern + "\n"))
+        (source,) = read_corner_session(recorded / "session").places[1].clouds
+        assert source.name == "recordings/p1"
+    finally:
+        table.write_text(plain)
+
+
+def test_clouds_beside_recordings_at_one_place_are_refused(recorded: Path) -> None:
+    table = recorded / "session/positions.csv"
+    plain = table.read_text()
+    stray = recorded / "session/recordings/stray.npy"
+    try:
+        np.save(stray, np.zeros((10, 3)))
+        table.write_text(plain.replace("recordings/p1\n", "recordings/*\n"))
+        with pytest.raises(InputError, match="beside sweep recordings"):
+            read_corner_session(recorded / "session")
+    finally:
+        stray.unlink()
+        table.write_text(plain)

@@ -41,6 +41,7 @@ def calibrate(
     beams_turn: Annotated[Sense | None, Parameter(group="Turntable sessions")] = None,
     table_turns: Annotated[Sense | None, Parameter(group="Turntable sessions")] = None,
     estimate_scale: Annotated[bool, Parameter(negative=(), show_default=False, group="Corner sessions")] = False,
+    turntable: Annotated[Path | None, Parameter(group="Corner sessions")] = None,
     axis_beam_deg: Annotated[FiniteFloat | None, Parameter(group="Sweep recordings")] = None,
     start: Annotated[Path | None, Parameter(group="Sweep recordings")] = None,
     never_stops: Annotated[bool | None, Parameter(negative="--stops", group="Sweep recordings")] = None,
@@ -80,6 +81,9 @@ def calibrate(
         The same for the turntable as its readings grow: negated readings show in no residual either.
     estimate_scale
         Estimate the scale between the LiDAR's metres and the world's.
+    turntable
+        The calibration of the turntable on which sweep recordings among a corner session's clouds were made, in place
+        of the one that the session names.
     axis_beam_deg
         The beam angle that points along the turntable's axis, to some degrees, where the fan of beams holds the axis.
     start
@@ -116,15 +120,28 @@ def calibrate(
             quiet=quiet,
         )
         return
-    if axis_beam_deg is not None or start is not None or never_stops is not None:
-        option = "--axis-beam-deg" if axis_beam_deg is not None else "--start" if start is not None else "--never-stops"
-        raise InputError(option, "is for sweep recordings", expected="a folder with recording.toml")
     found = session_format(session)
+    if axis_beam_deg is not None or start is not None:
+        option = "--axis-beam-deg" if axis_beam_deg is not None else "--start"
+        raise InputError(option, "is for sweep recordings", expected="a folder with recording.toml")
     if found == CORNER_SESSION_FORMAT:
         _calibrate_corners(
-            session, output, method, estimate_scale, want_mm, want_deg, report=report, json=json, quiet=quiet
+            session,
+            output,
+            method,
+            estimate_scale,
+            want_mm,
+            want_deg,
+            turntable=turntable,
+            never_stops=bool(never_stops),
+            report=report,
+            json=json,
+            quiet=quiet,
         )
         return
+    if turntable is not None or never_stops is not None:
+        option = "--never-stops" if turntable is None else "--turntable"
+        raise InputError(option, "is for sweep recordings", expected="a recording, or a corner session with recordings")
     if found != SESSION_FORMAT:
         expected = f'"{SESSION_FORMAT}" or "{CORNER_SESSION_FORMAT}"'
         raise InputError(session / "session.toml", f"is {found!r}", field="format", expected=expected)
@@ -193,6 +210,8 @@ def _calibrate_corners(
     want_mm: float | None,
     want_deg: float | None,
     *,
+    turntable: Path | None,
+    never_stops: bool,
     report: bool,
     json: bool,
     quiet: bool,
@@ -206,6 +225,8 @@ def _calibrate_corners(
         estimate_scale=estimate_scale or None,
         want_mm=want_mm,
         want_deg=want_deg,
+        turntable=turntable,
+        never_stops=never_stops,
         report=report,
         json=json,
         quiet=quiet,

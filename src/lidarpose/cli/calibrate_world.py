@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,8 @@ def calibrate_world_session(
     report: bool = True,
     json: bool = False,
     quiet: bool = False,
+    turntable: Path | None = None,
+    never_stops: bool = False,
 ) -> WorldCalibration:
     """Calibrate a corner session and write `output`/calibration.json and `output`/report.html.
 
@@ -45,6 +48,10 @@ def calibrate_world_session(
         Write the report too.
     json
         Print one JSON object in place of the summary.
+    turntable
+        The calibration of the turntable on which recordings among the clouds were made, in place of the session's own.
+    never_stops
+        It turned on during their sweeps.
 
     Raises
     ------
@@ -57,25 +64,33 @@ def calibrate_world_session(
     from lidarpose.errors import InputError
     from lidarpose.report.world_page import world_page
     from lidarpose.storage.atomic import write_text
-    from lidarpose.storage.calibration import write_calibration
+    from lidarpose.storage.calibration import read_turntable_calibration, write_calibration
     from lidarpose.storage.corner_session import read_corner_session, session_provenance, truth_beside
+    from lidarpose.workflows.recorded_corners import with_scans
     from lidarpose.workflows.world import WORLD_METHODS, world_run
 
     chosen = next((name for name in WORLD_METHODS if name == method), None)
     if chosen is None:
         raise InputError("--method", f"is {method!r}", expected="for a corner session: " + ", ".join(WORLD_METHODS))
     session = read_corner_session(session_folder)
+    if (turntable is not None or never_stops) and not session.has_recordings:
+        option = "--never-stops" if turntable is None else "--turntable"
+        raise InputError(option, "is for sweep recordings", expected="folders of recordings in the column clouds")
+    if turntable is not None:
+        session = replace(session, turntable=read_turntable_calibration(turntable))
     options = {
         "method": method,
         "estimate_scale": estimate_scale,
         "want_mm": want_mm,
         "want_deg": want_deg,
         "seed": seed,
+        "turntable": None if turntable is None else str(turntable),
+        "never_stops": never_stops,
     }
     steps = len(session.places) + sum(len(p.clouds) for p in session.places)
     with progress("Reading clouds", steps, quiet=quiet or json) as advance:
         run = world_run(
-            session,
+            with_scans(session, never_stops=never_stops),
             chosen,
             estimate_scale=estimate_scale,
             wishes={k: v for k, v in (("want_mm", want_mm), ("want_deg", want_deg)) if v is not None},
@@ -183,8 +198,14 @@ def inspect_world_session(session_folder: Path) -> dict[str, Any]:
             for p in session.places
         ],
         "cloud_frame": session.cloud_frame,
-        "warnings": layout_warnings(session),
+        "warnings": [*layout_warnings(session), *_recording_warnings(session)],
     }
+
+
+def _recording_warnings(session: CornerSession) -> list[str]:
+    if session.turntable is None and session.has_recordings:
+        return ["places hold sweep recordings: name turntable_calibration in session.toml, or give --turntable"]
+    return []
 
 
 def layout_warnings(session: CornerSession) -> list[str]:

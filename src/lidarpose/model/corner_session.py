@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray, as_float_array
 from lidarpose.geometry.rings import crossing_of_points, with_beams_crossing
+from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.cloud import Cloud
+from lidarpose.model.recording import SweepRecording
 from lidarpose.model.scan import LidarSpec
 
 CloudFrame = Literal["lidar", "camera"]
@@ -25,6 +27,18 @@ class CloudSource(Protocol):
 
     def load(self) -> Cloud:
         """Read it. Raises InputError if it is missing or unreadable."""
+        ...
+
+
+@runtime_checkable
+class RecordingSource(Protocol):
+    """A sweep recording somewhere in place of a cloud: it becomes one by its turntable's calibration."""
+
+    @property
+    def name(self) -> str: ...
+
+    def recording(self) -> SweepRecording:
+        """Open it. Raises InputError if it is missing or unreadable."""
         ...
 
 
@@ -69,6 +83,8 @@ class CornerSession:
         How well each world coordinate was measured; None where the user does not say.
     estimate_scale
         Whether the user asks for the factor of eq. (2) of the corner paper as well.
+    turntable
+        The calibration of the turntable by which recordings among the places' clouds become clouds.
     """
 
     name: str
@@ -77,6 +93,12 @@ class CornerSession:
     estimate_scale: bool = False
     cloud_frame: CloudFrame = "lidar"
     lidar: LidarSpec = field(default_factory=LidarSpec)
+    turntable: TurntableCalibration | None = None
+
+    @property
+    def has_recordings(self) -> bool:
+        """Whether any place holds a sweep recording."""
+        return any(isinstance(source, RecordingSource) for place in self.places for source in place.clouds)
 
 
 @dataclass(frozen=True, eq=False)

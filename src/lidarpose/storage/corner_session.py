@@ -13,15 +13,17 @@ from pydantic import Field
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose
-from lidarpose.model.calibration import WorldCalibration
+from lidarpose.model.calibration import TurntableCalibration, WorldCalibration
 from lidarpose.model.cloud import Cloud
-from lidarpose.model.corner_session import CornerPlace, CornerSession, CrossingBeams
+from lidarpose.model.corner_session import CloudFrame, CornerPlace, CornerSession, CrossingBeams
+from lidarpose.model.recording import SweepRecording
 from lidarpose.model.scan import LidarSpec
 from lidarpose.storage.atomic import replacing_folder, restore_folder, write_text
-from lidarpose.storage.calibration import read_calibration
+from lidarpose.storage.calibration import read_calibration, read_turntable_calibration
 from lidarpose.storage.documents import Schema, check_format, parse, read_toml, shown
 from lidarpose.storage.limits import find_files
 from lidarpose.storage.provenance import provenance
+from lidarpose.storage.recording import HEAD, is_recording, recording_files
 from lidarpose.storage.session import CORNER_SESSION_FORMAT, LidarSection, inside
 from lidarpose.storage.session_folder import check_free
 from lidarpose.storage.tables import TextTable, read_text_table
@@ -50,6 +52,7 @@ class _SessionFile(Schema):
     world_sigma_m: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     estimate_scale: bool = False
     cloud_frame: Literal["lidar", "camera"] = "lidar"
+    turntable_calibration: str | None = None
     lidar: _LidarSection = _LidarSection()
 
 
@@ -67,6 +70,28 @@ class FileCloud:
         return read_cloud(self.path)
 
 
+@dataclass(frozen=True)
+class FileRecording:
+    """One sweep recording of a session: a cloud, once the turntable's calibration is known."""
+
+    path: Path
+    name: str
+
+    def recording(self) -> SweepRecording:
+        """Open the recording. Raises InputError if a file of it is missing or unreadable."""
+        from lidarpose.storage.recording import read_recording
+
+        return read_recording(self.path)
+
+    def load(self) -> Cloud:
+        """Raise InputError: by itself a recording is no cloud."""
+        raise InputError(
+            self.path,
+            "is a sweep recording, and the turntable's calibration is not given",
+            expected='turntable_calibration = "calibration.json" in session.toml, or --turntable',
+        )
+
+
 def read_corner_session(folder: Path) -> CornerSession:
     """Read a corner session's description; clouds are read later, when they are asked for.
 
@@ -81,9 +106,10 @@ def read_corner_session(folder: Path) -> CornerSession:
         raise InputError(folder, problem, expected="a session's folder")
     document = parse(file, _SessionFile, check_format(file, read_toml(file), CORNER_SESSION_FORMAT))
     places = _read_places(folder, inside(folder, document.positions, file, "positions"))
+    cloud_frame, turntable = _recorded(folder, file, document, places)
     crossing_m = document.lidar.beam_crossing_m
     if crossing_m:
-        if document.cloud_frame != "lidar":
+        if cloud_frame != "lidar":
             raise InputError(
                 file,
                 "is for clouds in the frame of a multi-beam LiDAR",
@@ -96,9 +122,27 @@ def read_corner_session(folder: Path) -> CornerSession:
         places,
         document.world_sigma_m,
         document.estimate_scale,
-        document.cloud_frame,
+        cloud_frame,
         document.lidar.spec(),
+        turntable,
     )
+
+
+def _recorded(
+    folder: Path, file: Path, document: _SessionFile, places: tuple[CornerPlace, ...]
+) -> tuple[CloudFrame, TurntableCalibration | None]:
+    """The clouds' frame, the camera's where any is a recording, and the calibration that makes clouds of those."""
+    recorded = any(isinstance(source, FileRecording) for place in places for source in place.clouds)
+    if recorded and document.cloud_frame != "camera" and "cloud_frame" in document.model_fields_set:
+        problem = f'is "{document.cloud_frame}", but places hold sweep recordings'
+        raise InputError(
+            file, problem, field="cloud_frame", expected='"camera", where the calibration puts their points'
+        )
+    frame: CloudFrame = "camera" if recorded else document.cloud_frame
+    if document.turntable_calibration is None:
+        return frame, None
+    path = inside(folder, document.turntable_calibration, file, "turntable_calibration")
+    return frame, read_turntable_calibration(path)
 
 
 def _crossing(place: CornerPlace, crossing_m: float) -> CornerPlace:
@@ -150,8 +194,17 @@ def _near(table: TextTable, row: int) -> FloatArray | None:
     return np.array([table.number(row, name) for name in _NEAR])
 
 
-def _find_clouds(folder: Path, file: Path, line: int, pattern: str) -> Iterator[FileCloud]:
+def _find_clouds(folder: Path, file: Path, line: int, pattern: str) -> Iterator[FileCloud | FileRecording]:
     found = find_files(folder, pattern)
+    recordings = _find_recordings(folder, pattern, found or [])
+    if recordings:
+        others = [path for path in found or [] if path.parent not in recordings]
+        if others:
+            problem = f"line {line}: {pattern!r} matches {others[0].name} beside sweep recordings"
+            raise InputError(file, problem, field="clouds", expected="clouds, or folders of sweep recordings")
+        for path in recordings:
+            yield FileRecording(path, path.relative_to(folder).as_posix())
+        return
     if found is None:
         expected = "a pattern inside the session's folder, such as clouds/p00/*.pcd"
         raise InputError(file, f"line {line} has {shown(pattern)}", field="clouds", expected=expected)
@@ -161,13 +214,19 @@ def _find_clouds(folder: Path, file: Path, line: int, pattern: str) -> Iterator[
             file,
             f"line {line}: no file matches {shown(pattern)}",
             field="clouds",
-            expected="at least one cloud (" + " ".join(CLOUD_SUFFIXES) + ")",
+            expected="at least one cloud (" + " ".join(CLOUD_SUFFIXES) + "), or the folder of a sweep recording",
         )
     for path in found:
         if path.suffix.lower() not in CLOUD_SUFFIXES:
             problem = f"line {line}: {path.name} matches {pattern!r} but is no cloud"
             raise InputError(file, problem, field="clouds", expected="files " + " ".join(CLOUD_SUFFIXES))
         yield FileCloud(path, path.relative_to(folder).as_posix())
+
+
+def _find_recordings(folder: Path, pattern: str, files: list[Path]) -> list[Path]:
+    """Folders of sweep recordings that match a pattern, or hold the files that do."""
+    heads = find_files(folder, f"{pattern}/{HEAD}") or []
+    return sorted({path.parent for path in [*heads, *files] if is_recording(path.parent)})
 
 
 def write_corner_session(folder: Path, session: CornerSession, *, suffix: str = ".pcd", force: bool = False) -> None:
@@ -223,7 +282,10 @@ def session_provenance(folder: Path, session: CornerSession, options: Mapping[st
     record = provenance("calibrate", folder, [folder / "session.toml", folder / document.positions], options)
     clouds = [source for place in session.places for source in place.clouds]
     files = [source.source if isinstance(source, CrossingBeams) else source for source in clouds]
-    sizes = [source.path.stat().st_size for source in files if isinstance(source, FileCloud)]
+    paths = [source.path for source in files if isinstance(source, FileCloud)]
+    for source in files:
+        paths += recording_files(source.path) if isinstance(source, FileRecording) else []
+    sizes = [path.stat().st_size for path in paths]
     return record | {"clouds": {"files": len(clouds), "bytes": sum(sizes)}}
 
 

@@ -49,6 +49,7 @@ from lidarpose.workflows.corner_target import (
     gather,
     observe,
 )
+from lidarpose.workflows.recorded_corners import with_scans
 from lidarpose.workflows.thin_face import with_thin_face
 from lidarpose.workflows.world_evidence import corners_run, joint_run
 
@@ -89,6 +90,7 @@ def locate_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda:
     UndeterminedError
         If no corner, or more than one, moves as the world coordinates say.
     """
+    session = with_scans(session)
     found = find_target(session, seed=seed, tick=tick)
     if found.ambiguous:
         raise UndeterminedError(
@@ -163,7 +165,7 @@ def world_run(
         If the data determine no pose.
     """
     scale_too = session.estimate_scale if estimate_scale is None else estimate_scale
-    session = replace(session, estimate_scale=scale_too)
+    session = with_scans(replace(session, estimate_scale=scale_too))
     located = located or locate_target(session, seed=seed, tick=tick)
     found, crops = located.found, located.crops
     if found.by_edges and method != "joint":

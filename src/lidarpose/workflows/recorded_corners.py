@@ -1,0 +1,66 @@
+"""Sweep recordings as the clouds of a corner session: assembled in the camera's frame each time they are asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarpose.errors import InputError
+from lidarpose.model.calibration import TurntableCalibration
+from lidarpose.model.cloud import Cloud
+from lidarpose.model.corner_session import CloudSource, CornerSession, RecordingSource
+from lidarpose.workflows.scanning import ScanOptions, assemble_scan
+
+
+@dataclass(frozen=True, eq=False)
+class ScannedCloud:
+    """A recording with its turntable's calibration: a cloud in the camera's frame."""
+
+    source: RecordingSource
+    calibration: TurntableCalibration
+    never_stops: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.source.name
+
+    def load(self) -> Cloud:
+        options = ScanOptions(never_stops=self.never_stops, intensity=False)
+        parts = [part.points for part in assemble_scan(self.source.recording(), self.calibration, options)]
+        points = np.concatenate(parts) if parts else np.zeros((0, 3), dtype=np.float32)
+        return Cloud(points, frame="camera")
+
+
+def with_scans(session: CornerSession, *, never_stops: bool = False) -> CornerSession:
+    """The session with clouds in place of recordings.
+
+    Parameters
+    ----------
+    never_stops
+        The turntable turned on during the sweeps: its readings are interpolated by time.
+
+    Raises
+    ------
+    InputError
+        If there are recordings and no calibration of their turntable, or their clouds are said to be in another frame.
+    """
+    if not session.has_recordings:
+        return session
+    turntable = session.turntable
+    if turntable is None or session.cloud_frame != "camera":
+        raise InputError(
+            session.name,
+            "has sweep recordings in place of clouds, and the turntable's calibration is not given"
+            if turntable is None
+            else "has sweep recordings, but its clouds are said to be in the LiDAR's frame",
+            expected='turntable_calibration = "calibration.json" in session.toml, or --turntable'
+            if turntable is None
+            else 'cloud_frame = "camera"',
+        )
+
+    def scanned(source: CloudSource) -> CloudSource:
+        return ScannedCloud(source, turntable, never_stops) if isinstance(source, RecordingSource) else source
+
+    places = tuple(replace(place, clouds=tuple(map(scanned, place.clouds))) for place in session.places)
+    return replace(session, places=places)
