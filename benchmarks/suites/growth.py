@@ -6,6 +6,7 @@ Exponents by least squares over the logarithms.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
@@ -24,6 +25,7 @@ SIZES = {
 }
 ROUNDS = {"places": 3, "frames": 9, "points": 5, "assembled": 5, "written": 5}
 LEAST_MB = 1.0
+STOCK_MB = 5.0
 WORK = {
     "places": "`calibrate`, turntable, places",
     "frames": "`calibrate`, world, frames",
@@ -55,7 +57,7 @@ def run(effort: Effort) -> Report:
     for name, values in sizes.items():
         seconds, memory = [median(one) for one in zip(*rounds[name], strict=True)], peaks[name]
         # Of each round by itself: its sizes ran one after the other, on a machine of one speed.
-        both = median(exponent(values, one) for one in rounds[name]), exponent(values, memory)
+        both = median(exponent(values, one) for one in rounds[name]), _memory_exponent(values, memory)
         if name in ("places", "frames", "points"):
             figures |= {f"growth.{name}_s": both[0], f"growth.{name}_mb": both[1]}
         # Of next to nothing an exponent says nothing.
@@ -75,8 +77,15 @@ def run(effort: Effort) -> Report:
     return Report(figures, [Table("Growth", columns, rows, _TEXT)], curves)
 
 
+def _memory_exponent(sizes: Sequence[float], memory: Sequence[float]) -> float:
+    """Of the sizes that take more than a few MB: less is found in what the process has in stock."""
+    told = [(size, mb) for size, mb in zip(sizes, memory, strict=True) if mb > STOCK_MB]
+    return exponent(*zip(*told, strict=True)) if len(told) > 1 else exponent(sizes, memory)
+
+
 _TEXT = (
     "Processor time of all cores, all sizes in turn in one warm process; the exponent is the median of those of the "
     "rounds. Memory: each size in a process of its own, after a small one of the same kind, how far the process rises "
-    "above where it stood with its input in place (the turntable's and the world's input are files)."
+    "above where it stood with its input in place (the turntable's and the world's input are files); sizes that take "
+    "less than 5 MB do not count for its exponent."
 )
