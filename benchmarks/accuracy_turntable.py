@@ -22,9 +22,10 @@ import numpy as np
 from benchmarks.limits import CORNER_PX, STEP_PX, STRIPE_PX, motion_bound, pose_limits
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray
+from lidarpose.model.rig_family import Family
 from lidarpose.refine.turntable import JointOptions, refine_turntable
 from lidarpose.simulate.observations import Blunders, simulate_observations
-from lidarpose.simulate.rig import Family, TurntableRig, draw_rig
+from lidarpose.simulate.rig import TurntableRig, draw_rig
 from lidarpose.solve.paper import solve_paper
 
 START, END = "<!-- turntable joint estimate: start -->", "<!-- turntable joint estimate: end -->"

@@ -42,6 +42,8 @@ def test_points_behind_the_camera_have_no_pixel() -> None:
 
 
 def test_pixels_that_no_ray_reaches_have_no_direction() -> None:
-    folding = Camera(1000, 1000, np.array([[500.0, 0, 500], [0, 500, 500], [0, 0, 1]]), "plumb_bob", [-0.5, 0, 0, 0])
+    folding = Camera(
+        1000, 1000, np.array([[500.0, 0, 500], [0, 500, 500], [0, 0, 1]]), "plumb_bob", np.array([-0.5, 0, 0, 0])
+    )
     assert np.isnan(folding.undistort([[500.0 + 600.0, 500.0]])).all()
     assert np.isfinite(folding.undistort([[600.0, 520.0]])).all()

@@ -7,8 +7,9 @@ import pytest
 from scipy.optimize import brentq
 
 from lidarpose.geometry.se3 import Pose
+from lidarpose.model.rig_family import Family
 from lidarpose.simulate.observations import Blunders, simulate_observations
-from lidarpose.simulate.rig import Family, TurntableRig, draw_rig
+from lidarpose.simulate.rig import TurntableRig, draw_rig
 
 
 def pose_by_matrices(rig: TurntableRig, place: int) -> Pose:

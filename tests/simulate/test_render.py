@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from lidarpose.model.rig_family import FAMILIES, Family
 from lidarpose.simulate.camera_render import Photography, View, pixel_rays
 from lidarpose.simulate.lidar import LidarBehaviour, scan_scene
-from lidarpose.simulate.rig import FAMILIES, Family, TurntableRig, draw_rig, paper_camera
+from lidarpose.simulate.rig import TurntableRig, draw_rig, paper_camera
 from lidarpose.simulate.session import SimulatedSession, SimulationOptions, simulate_session
 from lidarpose.simulate.turntable_scene import draw_scene
 

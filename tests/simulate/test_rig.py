@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from lidarpose.errors import InputError
-from lidarpose.simulate.rig import FAMILIES, Family, TurntableRig, draw_rig
+from lidarpose.model.rig_family import FAMILIES, Family
+from lidarpose.simulate.rig import TurntableRig, draw_rig
 
 
 def scan_plane_to_axis_deg(rig: TurntableRig) -> float:
@@ -107,11 +108,3 @@ def test_other_boards_and_lenses_are_drawn() -> None:
         u, v = np.meshgrid(np.linspace(0, 811, 12), np.linspace(0, 616, 12))
         pixels = np.stack([u, v], -1)
         np.testing.assert_allclose(camera.project(camera.rays(pixels)), pixels, atol=1e-6)
-
-
-def test_the_command_offers_every_family() -> None:
-    from typing import get_args
-
-    from lidarpose.cli.simulate_turntable import FamilyName
-
-    assert get_args(FamilyName) == FAMILIES

@@ -11,8 +11,9 @@ import pytest
 
 from lidarpose.errors import InputError, UndeterminedError
 from lidarpose.model.observation import PlaceFeatures, PlaceObservation, ScanLine, TurntableObservations
+from lidarpose.model.rig_family import FAMILIES
 from lidarpose.simulate.observations import simulate_observations
-from lidarpose.simulate.rig import FAMILIES, draw_rig
+from lidarpose.simulate.rig import draw_rig
 from lidarpose.solve.assignment import Assignment, assign
 from lidarpose.solve.assignment_blind import motion_without_stripes
 from lidarpose.solve.paper import board_poses, solve_paper

@@ -37,7 +37,7 @@ def test_exact_corners_give_the_exact_pose_up_to_half_a_turn(turn: float, axis: 
 
 def test_noise_near_half_a_turn_costs_cayley_no_accuracy() -> None:
     rng = np.random.default_rng(2)
-    errors = {0.3: [], np.pi: []}
+    errors: dict[float, list[float]] = {0.3: [], np.pi: []}
     for turn, found in errors.items():
         T = Pose(exp_so3([0.0, 0.0, turn]), np.zeros(3))
         for _ in range(100):

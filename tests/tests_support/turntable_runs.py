@@ -8,10 +8,11 @@ import numpy as np
 
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.observation import LeftOut, TurntableObservations
+from lidarpose.model.rig_family import Family
 from lidarpose.model.turntable_run import Deviation, FunctionDeviation, TurntableRun
 from lidarpose.refine.turntable import JointOptions, refine_turntable
 from lidarpose.simulate.observations import Blunders, simulate_observations
-from lidarpose.simulate.rig import Family, draw_rig
+from lidarpose.simulate.rig import draw_rig
 from lidarpose.simulate.session import simulate_session
 from lidarpose.solve.paper import PaperSolution, solve_paper
 from lidarpose.solve.turntable_function import FunctionDeviations

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from lidarpose.model.rig_family import FAMILIES, Family
 from lidarpose.model.turntable import TurntableMotion
-from lidarpose.simulate.rig import FAMILIES, Family, TurntableRig, draw_rig
+from lidarpose.simulate.rig import TurntableRig, draw_rig
 from lidarpose.simulate.session import simulate_session
 from lidarpose.workflows.turntable import calibrate_turntable
 

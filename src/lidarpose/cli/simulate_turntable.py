@@ -3,32 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from cyclopts import Parameter, validators
 
 from lidarpose.cli.options import FiniteFloat, Json, PositiveFloat, Quiet
-
-FamilyName = Literal[
-    "paper",
-    "upside-down",
-    "left",
-    "right",
-    "axis-up",
-    "axis-down",
-    "far-axis",
-    "offset-readings",
-    "tilted-scan-plane",
-    "flat-scan-plane",
-    "few-places",
-    "many-places",
-    "fold-horizontal",
-    "fold-vertical",
-    "mixed",
-    "axis-in-scan-plane",
-    "other-boards",
-    "other-lenses",
-]
+from lidarpose.model.rig_family import Family
 
 
 def simulate_turntable(
@@ -36,7 +16,7 @@ def simulate_turntable(
     /,
     *,
     seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0,
-    family: FamilyName = "paper",
+    family: Family = "paper",
     places: Annotated[int | None, Parameter(validator=validators.Number(gte=1, lte=10_000))] = None,
     step_deg: PositiveFloat | None = None,
     start_deg: FiniteFloat | None = None,

@@ -21,6 +21,7 @@ from lidarpose.report.page import (
     document,
     figure,
     footer,
+    headline,
     legend_key,
     provenance_block,
     section,
@@ -76,11 +77,6 @@ def mounting_verdict(run: MountingRun) -> Verdict:
     """The verdict in words, with reasons and steps."""
     quality = run.estimate.quality
     tone: Tone = quality.verdict
-    headline = {
-        "good": "Good: use this calibration",
-        "doubtful": "Doubtful: read the reasons first",
-        "rejected": "Rejected: do not use this calibration",
-    }[tone]
     figures = quality.figures
     claim = "The" if tone == "good" else "By its own figures the"
     say = (
@@ -88,7 +84,7 @@ def mounting_verdict(run: MountingRun) -> Verdict:
         f"beside it to {short(figures['sigma_shift_mm'])} mm, from "
         f"{plural(len(run.estimate.surfaces), 'flat surface')} with {figures['returns']} returns."
     )
-    return Verdict(tone, headline, say, [sentence(text) for text in quality.reasons], list(_todo(run)))
+    return Verdict(tone, headline(tone), say, [sentence(text) for text in quality.reasons], list(_todo(run)))
 
 
 def _todo(run: MountingRun) -> Iterator[str]:

@@ -48,6 +48,16 @@ class Verdict:
     todo: Sequence[str] = ()
 
 
+def headline(tone: Tone) -> str:
+    """What a calibration's verdict says first."""
+    return {
+        "good": "Good: use this calibration",
+        "doubtful": "Doubtful: read the reasons first",
+        "rejected": "Rejected: do not use this calibration",
+        "unknown": "No verdict",
+    }[tone]
+
+
 def document(title: str, kind: str, body: Iterable[object], scene: Mapping[str, Any] | None = None) -> str:
     """A whole page. `scene` is what the 3D viewer shows, see `lidarpose.report.scene`."""
     scripts: list[Markup] = []
@@ -96,23 +106,15 @@ def figure(
     title: str, draw: Drawing, caption: str = "", legend: Iterable[Markup] = (), *, size: Size = "half"
 ) -> Markup:
     """A figure drawn once for a desktop and once for a phone."""
-    keys = list(legend)
-    return el(
-        "figure",
-        el("h3", title),
-        el("ul", *keys, class_="legend") if keys else "",
-        *_drawn(draw, size),
-        el("figcaption", caption) if caption else "",
-        class_=size,
-    )
+    return picture(title, _drawn(draw, size), caption, legend, size=size)
 
 
-def _drawn(draw: Drawing, size: Size) -> tuple[Markup, ...]:
+def _drawn(draw: Drawing, size: Size) -> Markup:
     if size == "third":
         # As wide as a phone's column: one drawing serves both.
-        return (draw(PHONE_PX),)
+        return draw(PHONE_PX)
     desk = draw(DESK_WIDE_PX if size == "wide" else DESK_HALF_PX)
-    return el("div", desk, class_="desk"), el("div", draw(PHONE_PX), class_="phone")
+    return join((el("div", desk, class_="desk"), el("div", draw(PHONE_PX), class_="phone")))
 
 
 def picture(

@@ -24,6 +24,7 @@ from lidarpose.report.page import (
     document,
     folded,
     footer,
+    headline,
     legend_key,
     provenance_block,
     section,
@@ -83,13 +84,8 @@ def turntable_verdict(run: TurntableRun, numbers: TurnNumbers | None = None) -> 
         say = "The paper's closed form gives the pose, but not how sure it is. Calibrate with the joint method to know."
         return Verdict("unknown", "No verdict", say, run.notes, ())
     tone: Tone = quality.verdict
-    headline = {
-        "good": "Good: use this calibration",
-        "doubtful": "Doubtful: read the reasons first",
-        "rejected": "Rejected: do not use this calibration",
-    }[tone]
     reasons = tuple(sentence(text) for text in (*quality.reasons, *run.notes))
-    return Verdict(tone, headline, _say(run, found), reasons, todo(run))
+    return Verdict(tone, headline(tone), _say(run, found), reasons, todo(run))
 
 
 def wished(run: TurntableRun) -> tuple[float | None, float | None]:

@@ -21,6 +21,7 @@ from lidarpose.report.page import (
     card,
     document,
     footer,
+    headline,
     legend_key,
     provenance_block,
     section,
@@ -57,12 +58,7 @@ def world_verdict(run: WorldRun) -> Verdict:
     if quality is None:
         return Verdict("unknown", "No verdict", "How sure the pose is, is not known.")
     tone: Tone = quality.verdict
-    headline = {
-        "good": "Good: use this calibration",
-        "doubtful": "Doubtful: read the reasons first",
-        "rejected": "Rejected: do not use this calibration",
-    }[tone]
-    return Verdict(tone, headline, _say(run), [sentence(text) for text in quality.reasons], list(_todo(run)))
+    return Verdict(tone, headline(tone), _say(run), [sentence(text) for text in quality.reasons], list(_todo(run)))
 
 
 def _uncertain(run: WorldRun) -> UncertainPose | None:

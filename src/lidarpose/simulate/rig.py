@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
@@ -18,34 +18,13 @@ from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray, angle_between, as_float_array, unit
 from lidarpose.geometry.se3 import Pose, exp_so3
 from lidarpose.model.camera import Camera, DistortionModel
+from lidarpose.model.rig_family import FAMILIES, Family
 from lidarpose.model.scan import LidarSpec
 from lidarpose.model.session import DEFAULT_PLACEMENT
 from lidarpose.model.targets import Panel
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.simulate.board_pattern import Plate
 from lidarpose.simulate.light_sheet import beam_on_panel, chord_on_plate
-
-Family = Literal[
-    "paper",
-    "upside-down",
-    "left",
-    "right",
-    "axis-up",
-    "axis-down",
-    "far-axis",
-    "offset-readings",
-    "tilted-scan-plane",
-    "flat-scan-plane",
-    "few-places",
-    "many-places",
-    "fold-horizontal",
-    "fold-vertical",
-    "mixed",
-    "axis-in-scan-plane",
-    "other-boards",
-    "other-lenses",
-]
-FAMILIES: tuple[Family, ...] = get_args(Family)
 
 PAPER_PLACES = 87
 PAPER_ARC_DEG = 21.5

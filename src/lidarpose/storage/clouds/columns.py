@@ -61,6 +61,27 @@ class Columns:
             raise ValueError(f"the writer was opened for the fields {list(self.fields)}, found {list(cloud.fields)}")
 
 
+class CountedFile:
+    """A cloud file of rows whose header says how many: written first as of none, and again at the end, as long."""
+
+    def __init__(self, file: IO[bytes], columns: Columns) -> None:
+        self._file, self._columns, self._count = file, columns, 0
+        self._put_header()
+
+    def append(self, cloud: Cloud) -> None:
+        """Write the points of `cloud` after those before."""
+        write_rows(self._file, self._columns, cloud)
+        self._count += len(cloud)
+
+    def finish(self) -> None:
+        """Put the number of points into the header."""
+        self._file.seek(0)
+        self._put_header()
+
+    def _put_header(self) -> None:
+        raise NotImplementedError
+
+
 def write_rows(file: IO[bytes], columns: Columns, cloud: Cloud) -> None:
     """Append the cloud's rows to an open file, a block at a time."""
     columns.require_same(cloud)

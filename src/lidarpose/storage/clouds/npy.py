@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from numpy.lib import format as npy_format
 
 from lidarpose.errors import InputError
 from lidarpose.model.cloud import Cloud
-from lidarpose.storage.clouds.columns import Columns, read_rows, write_rows
+from lidarpose.storage.clouds.columns import Columns, CountedFile, read_rows
 from lidarpose.storage.npy_header import read_npy_header
 
 
@@ -44,22 +43,9 @@ def writer(path: Path, columns: Columns, shown: Path) -> Iterator[_Writer]:
         out.finish()
 
 
-class _Writer:
-    def __init__(self, file: IO[bytes], columns: Columns) -> None:
-        self._file, self._columns, self._count = file, columns, 0
-        self._put_header()
-
-    def append(self, cloud: Cloud) -> None:
-        """Write the points of `cloud` after those before."""
-        write_rows(self._file, self._columns, cloud)
-        self._count += len(cloud)
-
-    def finish(self) -> None:
-        # numpy pads its header so that the first extent can grow without changing the length.
-        self._file.seek(0)
-        self._put_header()
-
+class _Writer(CountedFile):
     def _put_header(self) -> None:
+        # numpy pads its header so that the first extent can grow without changing the length.
         plain = not self._columns.fields
         dtype = self._columns.xyz.newbyteorder("<") if plain else self._columns.row()
         shape = (self._count, 3) if plain else (self._count,)

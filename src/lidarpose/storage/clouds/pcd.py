@@ -21,7 +21,7 @@ from lidarpose.errors import InputError
 from lidarpose.model.cloud import Cloud
 from lidarpose.storage.atomic import replacing
 from lidarpose.storage.clouds import lzf
-from lidarpose.storage.clouds.columns import RGB, Columns, cloud_of_rows, parse_table, read_rows, write_rows
+from lidarpose.storage.clouds.columns import RGB, Columns, CountedFile, cloud_of_rows, parse_table, read_rows
 from lidarpose.storage.clouds.headers import fill, read_header_lines, whole_number
 from lidarpose.storage.limits import file_size, require_bytes
 
@@ -209,37 +209,31 @@ def writer(path: Path, columns: Columns, shown: Path) -> Iterator[_Writer]:
         out.finish()
 
 
-class _Writer:
+class _Writer(CountedFile):
     def __init__(self, file: IO[bytes], columns: Columns, shown: Path) -> None:
         self._packs = all(columns.fields.get(name) == np.uint8 for name in RGB)
         fields = dict(columns.fields)
         if self._packs:
             fields = {name: item for name, item in fields.items() if name not in RGB} | {"rgb": np.dtype(np.float32)}
-        self._columns = Columns(columns.xyz, fields)
-        self.row = self._columns.row()
+        packed = Columns(columns.xyz, fields)
+        self.row = packed.row()
         for name, item in fields.items():
             if item.base.kind not in "fiu" or item.base.itemsize > 8 or item.base == np.float16 or len(item.shape) > 1:
                 raise InputError(shown, f"PCD has no type for {item}", field=name, expected="numbers of up to 8 bytes")
             if not name.isascii() or name.split() != [name]:
                 raise InputError(shown, "is no name for a field of a PCD file", field=name, expected="one word")
-        self._file, self._count = file, 0
         self._length = len("\n".join(self._lines(0))) + _HEADER_MARGIN
-        self._put_header()
+        super().__init__(file, packed)
 
     def append(self, cloud: Cloud) -> None:
         """Write the points of `cloud` after those before."""
-        write_rows(self._file, self._columns, self._pack(cloud) if self._packs else cloud)
-        self._count += len(cloud)
-
-    def finish(self) -> None:
-        self._file.seek(0)
-        self._put_header()
+        super().append(self._pack(cloud) if self._packs else cloud)
 
     def _put_header(self) -> None:
         self._file.write(fill(self._lines(self._count), "# metres", self._length))
 
     def _lines(self, count: int) -> list[str]:
-        row = self._columns.row()
+        row = self.row
         names = row.names or ()
         return [
             "# .PCD v0.7 - Point Cloud Data file format",

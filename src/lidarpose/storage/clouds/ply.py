@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lidarpose.errors import InputError
 from lidarpose.model.cloud import Cloud
-from lidarpose.storage.clouds.columns import Columns, cloud_of_rows, parse_table, read_rows, write_rows
+from lidarpose.storage.clouds.columns import Columns, CountedFile, cloud_of_rows, parse_table, read_rows
 from lidarpose.storage.clouds.headers import fill, read_header_lines, whole_number
 from lidarpose.storage.limits import file_size, require_bytes
 
@@ -160,7 +160,7 @@ def writer(path: Path, columns: Columns, shown: Path) -> Iterator[_Writer]:
         out.finish()
 
 
-class _Writer:
+class _Writer(CountedFile):
     def __init__(self, file: IO[bytes], columns: Columns, shown: Path) -> None:
         for name, item in columns.fields.items():
             if item.str[1:] not in _NAMES:
@@ -168,23 +168,14 @@ class _Writer:
                 raise InputError(shown, f"PLY has no type for {item}", field=name, expected=wanted)
             if not name.isascii() or name.split() != [name]:
                 raise InputError(shown, "is no name for a property of a PLY file", field=name, expected="one word")
-        self._file, self._columns, self._count = file, columns, 0
+        self._row = columns.row()
         self._length = len("\n".join(self._lines(0))) + _HEADER_MARGIN
-        self._put_header()
-
-    def append(self, cloud: Cloud) -> None:
-        """Write the points of `cloud` after those before."""
-        write_rows(self._file, self._columns, cloud)
-        self._count += len(cloud)
-
-    def finish(self) -> None:
-        self._file.seek(0)
-        self._put_header()
+        super().__init__(file, columns)
 
     def _put_header(self) -> None:
         self._file.write(fill(self._lines(self._count), "comment metres", self._length))
 
     def _lines(self, count: int) -> list[str]:
-        row = self._columns.row()
+        row = self._row
         properties = [f"property {_NAMES[row[name].str[1:]]} {name}" for name in row.names or ()]
         return ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header"]
