@@ -205,9 +205,16 @@ def test_what_the_user_sees_on_his_rig_is_compared(
     beams, table = words[0], words[2]
     other = {"clockwise": "anticlockwise", "anticlockwise": "clockwise"}[beams.split("-from-")[0]]
     wrong = f"{other}-from-{beams.split('-from-')[1]}"
-    assert run([*command, "--beams-turn", beams, "--table-turns", table]) == 0
-    assert json.loads(capsys.readouterr().out)["verdict"] == "good"
-    assert run([*command, "--beams-turn", wrong, "--table-turns", table]) == 1
+    # Stated in the session, and on the command line, which goes first.
+    session = shutil.copytree(simulated_session, tmp_path / "stated")
+    with (session / "session.toml").open("a") as file:
+        file.write(f'\n[turning]\nbeams = "{wrong}"\ntable = "{table}"\n')
+    command[1] = str(session)
+    assert run([*command, "--beams-turn", beams]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["verdict"] == "good"
+    assert "compared with what was stated" in document["notes"][-1]
+    assert run(command) == 1
     document = json.loads(capsys.readouterr().out)
     assert document["verdict"] == "rejected"
     assert "written in reverse" in document["reasons"][0]

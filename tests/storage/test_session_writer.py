@@ -10,6 +10,7 @@ import pytest
 from lidarpose.cli.main import run
 from lidarpose.errors import InputError
 from lidarpose.model.image import GrayImage
+from lidarpose.model.sense import StatedSense
 from lidarpose.model.session import TurntableSession
 from lidarpose.simulate.rig import draw_rig, paper_camera
 from lidarpose.simulate.session import SimulatedSession, SimulationOptions, simulate_session
@@ -29,6 +30,7 @@ def assert_same(read: TurntableSession, written: TurntableSession) -> None:
     np.testing.assert_array_equal(read.camera.distortion, written.camera.distortion)
     assert read.panels == written.panels
     assert read.lidar == written.lidar
+    assert read.stated == written.stated
     assert set(read.board_images) == set(written.board_images)
     for name, shots in written.board_images.items():
         assert len(read.board_images[name]) == len(shots)
@@ -55,6 +57,17 @@ def test_a_session_is_read_back_as_it_was(tmp_path: Path) -> None:
     assert len(steps) == count_files(simulated.session) == 3 + 3 + 3
     assert_same(read_turntable_session(folder), simulated.session)
     assert sorted(p.name for p in folder.parent.iterdir()) == ["session", "session.truth.json"]
+
+
+def test_how_the_rig_turns_is_read_and_written(tmp_path: Path) -> None:
+    for k, stated in enumerate((StatedSense(table="clockwise-from-right"), StatedSense("anticlockwise-from-above"))):
+        session = replace(small().session, stated=stated)
+        write_turntable_session(tmp_path / str(k), session)
+        assert read_turntable_session(tmp_path / str(k)).stated == stated
+    text = (tmp_path / "1" / "session.toml").read_text()
+    (tmp_path / "1" / "session.toml").write_text(text.replace("anticlockwise-from-above", "upwards"))
+    with pytest.raises(InputError, match=r"turning\.beams"):
+        read_turntable_session(tmp_path / "1")
 
 
 def test_sweeps_placements_and_no_stripe_are_read_back(tmp_path: Path) -> None:

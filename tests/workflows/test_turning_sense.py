@@ -30,6 +30,16 @@ def test_upside_down_is_the_other_sense_of_the_beams(mounting: Pose, beams: str)
     assert "readings turn anticlockwise seen from above the image" in text
 
 
+def test_a_statement_fills_what_another_leaves_open_and_is_said() -> None:
+    on_command_line, in_session = StatedSense("clockwise-from-above"), StatedSense("anticlockwise-from-camera", None)
+    assert on_command_line.filled_from(in_session) == on_command_line
+    both = StatedSense(table="anticlockwise-from-above").filled_from(in_session)
+    assert both == StatedSense("anticlockwise-from-camera", "anticlockwise-from-above")
+    motion = TurntableMotion(UP, UPRIGHT)
+    assert "Both were compared" in turning_sense(motion, 0.3, both)
+    assert "--beams-turn anticlockwise-from-above" in turning_sense(motion, 0.3, on_command_line)
+
+
 READINGS = (0.1, 0.3, 0.5)
 
 

@@ -22,3 +22,7 @@ class StatedSense:
 
     beams: Sense | None = None
     table: Sense | None = None
+
+    def filled_from(self, other: StatedSense) -> StatedSense:
+        """The same, with what is not stated here taken from another statement."""
+        return StatedSense(self.beams or other.beams, self.table or other.table)

@@ -9,6 +9,7 @@ from typing import Protocol
 from lidarpose.model.camera import Camera
 from lidarpose.model.image import ImageSource
 from lidarpose.model.scan import LidarSpec, Scan
+from lidarpose.model.sense import StatedSense
 from lidarpose.model.targets import Panel
 
 DEFAULT_PLACEMENT = ""
@@ -54,6 +55,8 @@ class TurntableSession:
         By placement: images of the board in bright light.
     panels
         The chessboards of the board: two for a V board, in the order of the file (panel 0, panel 1).
+    stated
+        How beams and table turn, as whoever recorded it saw it on the rig.
     """
 
     name: str
@@ -62,3 +65,4 @@ class TurntableSession:
     board_images: Mapping[str, tuple[ImageSource, ...]]
     places: tuple[TurntablePlace, ...]
     lidar: LidarSpec = field(default_factory=LidarSpec)
+    stated: StatedSense = field(default_factory=StatedSense)

@@ -19,6 +19,7 @@ from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.model.camera import Camera
 from lidarpose.model.image import ImageSource
 from lidarpose.model.scan import LidarSpec, Scan
+from lidarpose.model.sense import Sense, StatedSense
 from lidarpose.model.session import DEFAULT_PLACEMENT, TurntablePlace, TurntableSession
 from lidarpose.model.targets import Panel
 from lidarpose.storage.camera_files import read_camera
@@ -55,12 +56,18 @@ class _BoardSection(Schema):
     panels: Annotated[list[_PanelSection], Field(min_length=1, max_length=2)]
 
 
+class _TurningSection(Schema):
+    beams: Sense | None = None
+    table: Sense | None = None
+
+
 class _SessionFile(Schema):
     format: Literal["lidarpose/turntable-session@1"]
     camera: str
     positions: str
     board: _BoardSection
     lidar: LidarSection = LidarSection()
+    turning: _TurningSection = _TurningSection()
 
 
 @dataclass(frozen=True)
@@ -106,7 +113,8 @@ def read_turntable_session(folder: Path, *, any_order: bool = False) -> Turntabl
     camera = read_camera(inside(folder, document.camera, file, "camera"))
     places = _read_positions(folder, inside(folder, document.positions, file, "positions"), camera, any_order)
     board_images = _find_board_images(folder, file, document.board.images, camera, {p.placement for p in places})
-    return TurntableSession(str(folder), camera, panels, board_images, places, document.lidar.spec())
+    stated = StatedSense(document.turning.beams, document.turning.table)
+    return TurntableSession(str(folder), camera, panels, board_images, places, document.lidar.spec(), stated)
 
 
 def session_format(folder: Path) -> str:

@@ -173,4 +173,7 @@ def _session_text(session: TurntableSession) -> str:
         lines.append(f"model = {json.dumps(session.lidar.model)}")
     if session.lidar.range_sigma_m is not None:
         lines.append(f"range_sigma_m = {session.lidar.range_sigma_m!r}")
+    said = {"beams": session.stated.beams, "table": session.stated.table}
+    if any(said.values()):
+        lines += ["", "[turning]", *(f'{key} = "{sense}"' for key, sense in said.items() if sense)]
     return "\n".join(lines) + "\n"

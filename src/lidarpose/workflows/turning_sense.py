@@ -36,14 +36,19 @@ class SenseCheck:
     notes: tuple[str, ...] = ()
 
 
-def turning_sense(motion: TurntableMotion, turntable_angle_rad: float) -> str:
-    """How growing beam angles and growing readings turn, each seen from where it is plainest."""
+def turning_sense(motion: TurntableMotion, turntable_angle_rad: float, stated: StatedSense | None = None) -> str:
+    """How growing beam angles and growing readings turn, each seen from where it is plainest.
+
+    And whether that was compared with a statement, or how to have it compared.
+    """
     beams = _plainest(_beam_axis(motion, turntable_angle_rad))
     table = _plainest(motion.axis_direction_camera)
+    found = f"By the files growing beam angles turn {_said(beams)}, and growing readings turn {_said(table)}."
+    if stated is not None and stated.beams and stated.table:
+        return f"{found} Both were compared with what was stated"
     return (
-        f"By the files growing beam angles turn {_said(beams)}, and growing readings turn {_said(table)}. Look whether "
-        "your rig does: a scan in reverse, or negated readings, show in no residual. "
-        f"To have it checked, state what you see; this would be --beams-turn {beams} --table-turns {table}"
+        f"{found} Compare with the rig: no residual shows scans in reverse or negated readings. To have it checked, "
+        f"state what you see; this would be --beams-turn {beams} --table-turns {table} (or [turning] in session.toml)"
     )
 
 

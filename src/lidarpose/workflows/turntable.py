@@ -116,7 +116,8 @@ def calibrate_turntable(
     options
         Of the joint estimate.
     stated
-        How beams and table turn, as the user sees it on his rig; a result that contradicts it is rejected.
+        How beams and table turn, as the user sees it on his rig, before what the session states; a result that
+        contradicts it is rejected.
     provenance
         For the calibration; what makes it, if it takes time, is called while the images are searched.
     step
@@ -135,6 +136,7 @@ def calibrate_turntable(
         recorded.append(provenance() if callable(provenance) else provenance or {})
         _import_what_follows()
 
+    stated = (stated or StatedSense()).filled_from(session.stated)
     features = detect_features(session, step=step, meanwhile=meanwhile)
     try:
         observations, fitted = assign_lines(session, features, first_panel=first_panel)
@@ -158,7 +160,7 @@ def calibrate_turntable(
         left_out = paper.left_out
     calibration = replace(
         calibration,
-        quality=checked(calibration, session, features, observations, start[1], estimate, stated or StatedSense()),
+        quality=checked(calibration, session, features, observations, start[1], estimate, stated),
     )
     return TurntableRun(
         method=method,
@@ -170,7 +172,7 @@ def calibrate_turntable(
         calibration=calibration,
         estimate=estimate,
         left_out=merge_left_out(observations.left_out, left_out),
-        notes=(*features.notes, turning_sense(calibration.motion, session.places[0].turntable_angle_rad)),
+        notes=(*features.notes, turning_sense(calibration.motion, session.places[0].turntable_angle_rad, stated)),
     )
 
 

@@ -111,6 +111,7 @@ def inspect_turntable(
     InputError
         If an image or scan cannot be read. Data that determine nothing are no error here; see `undetermined`.
     """
+    stated = (stated or StatedSense()).filled_from(session.stated)
     features: DetectedFeatures | None = None
     found: _Geometry | None = None
     undetermined: UndeterminedError | None = None
@@ -144,11 +145,11 @@ def inspect_turntable(
         expected_sigma=() if found is None else found.expected_sigma,
         weak=() if found is None else found.predicted.directions,
         remedies=() if found is None else found.remedies,
-        sense="" if found is None else found.sense(session),
+        sense="" if found is None else found.sense(session, stated),
         problems=(
             *_problems(session, degrees),
             *(features.notes if features else ()),
-            *(found.problems(session, stated or StatedSense()) if found is not None else ()),
+            *(found.problems(session, stated) if found is not None else ()),
         ),
         left_out=left_out,
         undetermined=undetermined,
@@ -170,8 +171,8 @@ class _Geometry:
     expected_sigma: tuple[tuple[float, float, float], ...]
     remedies: tuple[Remedy, ...]
 
-    def sense(self, session: TurntableSession) -> str:
-        return turning_sense(self.start[0], session.places[0].turntable_angle_rad)
+    def sense(self, session: TurntableSession, stated: StatedSense) -> str:
+        return turning_sense(self.start[0], session.places[0].turntable_angle_rad, stated)
 
     def problems(self, session: TurntableSession, stated: StatedSense) -> tuple[str, ...]:
         motion, poses = self.start
