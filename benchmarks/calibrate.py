@@ -18,6 +18,7 @@ from pathlib import Path
 import cv2
 
 from benchmarks.timing import Contest, beside
+from lidarpose.geometry.compiled import forced, installed
 from lidarpose.report.turntable_page import turntable_page
 from lidarpose.storage.session import read_turntable_session
 from lidarpose.workflows.turntable import calibrate_turntable
@@ -43,6 +44,12 @@ def calibrate(folder: Path, *, report: bool) -> None:
         turntable_page(run, {name: sources[0].load() for name, sources in session.board_images.items()})
 
 
+def by_numpy(folder: Path, *, report: bool) -> None:
+    """The same where no kernels are loaded."""
+    with forced(False):
+        calibrate(folder, report=report)
+
+
 def command(folder: Path, *options: str) -> None:
     """The command itself, in a new process, with its byte code at hand as in every installation."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
@@ -57,16 +64,23 @@ def simulate(folder: Path, places: int = PLACES) -> None:
 
 
 DECODING = "decoding the images alone"
+PLAIN, REPORT = "calibrate, modules and kernels loaded, no report", "calibrate, modules and kernels loaded, report"
+PLAIN_COMMAND, COMMAND = "lidarpose calibrate --no-report", "lidarpose calibrate"
 
 
 def measure(folder: Path, repeats: int = REPEATS) -> Contest:
     """Every way beside decoding, all of them in turn."""
     ways: dict[str, Callable[[], None]] = {
-        "calibrate, modules loaded, no report": lambda: calibrate(folder, report=False),
-        "calibrate, modules loaded, report": lambda: calibrate(folder, report=True),
-        "lidarpose calibrate --no-report": lambda: command(folder, "--no-report"),
-        "lidarpose calibrate": lambda: command(folder),
+        PLAIN: lambda: calibrate(folder, report=False),
+        REPORT: lambda: calibrate(folder, report=True),
+        "the same by NumPy, no report": lambda: by_numpy(folder, report=False),
+        "the same by NumPy, report": lambda: by_numpy(folder, report=True),
+        PLAIN_COMMAND: lambda: command(folder, "--no-report"),
+        COMMAND: lambda: command(folder),
     }
+    # What runs on comes to kernels by itself, after three sessions of this size; without numba there are none.
+    with forced(installed()):
+        calibrate(folder, report=True)
     calibrate(folder, report=True)
     command(folder)
     decode(folder)
@@ -80,10 +94,10 @@ def main() -> None:
         if len(sys.argv) == 1:
             simulate(folder)
         found = measure(folder)
-    print(f"{'':40s} {'seconds':>8s} {'ratio':>6s}")
-    print(f"{DECODING:40s} {found.reference_s:8.2f} {1.0:6.2f}")
+    print(f"{'':50s} {'seconds':>8s} {'ratio':>6s}")
+    print(f"{DECODING:50s} {found.reference_s:8.2f} {1.0:6.2f}")
     for name, value in found.seconds.items():
-        print(f"{name:40s} {value:8.2f} {found.over[name]:6.2f}")
+        print(f"{name:50s} {value:8.2f} {found.over[name]:6.2f}")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks.calibrate import DECODING, PLACES, measure, simulate
+from benchmarks.calibrate import COMMAND, DECODING, PLACES, PLAIN, PLAIN_COMMAND, REPORT, measure, simulate
 from benchmarks.report import Cell, Effort, Report, Table
 
 
@@ -17,12 +17,11 @@ def run(effort: Effort) -> Report:
         session = Path(folder) / "session"
         simulate(session, effort.pick(PLACES, 12))
         found = measure(session, effort.pick(5, 1))
-    plain, report, plain_command, command = found.over.values()
     figures = {
-        "calibrate.report": report,
-        "calibrate.plain": plain,
-        "calibrate.report_command": command,
-        "calibrate.plain_command": plain_command,
+        "calibrate.report": found.over[REPORT],
+        "calibrate.plain": found.over[PLAIN],
+        "calibrate.report_command": found.over[COMMAND],
+        "calibrate.plain_command": found.over[PLAIN_COMMAND],
     }
     rows: list[list[Cell]] = [[DECODING, found.reference_s, 1.0]]
     rows += [[name, value, found.over[name]] for name, value in found.seconds.items()]

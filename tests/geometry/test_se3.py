@@ -95,3 +95,11 @@ def test_covariances_of_composition_inverse_and_centre_agree_with_sampling() -> 
         sampled = np.cov(np.array(draws).T)
         scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
         np.testing.assert_allclose(sampled / scale, predicted / scale, atol=0.07)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_turn_or_twist_that_is_not_finite_is_no_pose(bad: float) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        Pose.rot_z(bad)
+    with pytest.raises(ValueError, match="finite"):
+        Pose.exp([0.0, 0.0, 0.0, 0.0, bad, 0.0])

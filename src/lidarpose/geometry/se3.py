@@ -9,6 +9,7 @@ theory for state estimation in robotics" (2018).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import overload
 
@@ -170,7 +171,7 @@ class Pose:
 
     @staticmethod
     def _of_proper(rotation: FloatArray, translation: FloatArray) -> Pose:
-        """A pose made of proper rotations by multiplication: nothing to check, nothing to copy."""
+        """A pose made of proper rotations, or of a finite turn: nothing to check, nothing to copy."""
         pose = object.__new__(Pose)
         rotation.setflags(write=False)
         translation.setflags(write=False)
@@ -198,12 +199,16 @@ class Pose:
     def exp(xi: ArrayLike) -> Pose:
         """The motion of a twist (6,) = (translation, rotation)."""
         twist = as_float_array(xi, (6,), "twist")
-        return Pose(exp_so3(twist[3:]), _left_jacobian(twist[3:]) @ twist[:3])
+        if not np.isfinite(twist).all():
+            raise ValueError("a pose must be finite")
+        return Pose._of_proper(exp_so3(twist[3:]), _left_jacobian(twist[3:]) @ twist[:3])
 
     @staticmethod
     def rot_z(angle_rad: float) -> Pose:
         """A turn about z, as a turntable makes it."""
-        return Pose(rotation_z(angle_rad), np.zeros(3))
+        if not math.isfinite(angle_rad):
+            raise ValueError("a pose must be finite")
+        return Pose._of_proper(rotation_z(angle_rad), np.zeros(3))
 
     def log(self) -> FloatArray:
         """The twist (6,) = (translation, rotation) whose ``exp`` this is; rotation at most half a turn."""
