@@ -159,6 +159,10 @@ class _Claims(Protocol):
         """Heights over the leant plane of those in every so manieth run of the cloud's points."""
         ...
 
+    def moments(self, slab: Slab, lean: FloatArray) -> FloatArray:
+        """Sums (4, 4) of the terms' products within the gate of the leant plane and outside of seams."""
+        ...
+
     def only(self, keep: BoolArray) -> _Claims:
         """These points without those that are not to be kept."""
         ...
@@ -183,6 +187,14 @@ class _Terms:
         few = np.flatnonzero(self.held & _runs(every, RUN)[self.indices % BLOCK])
         return _rest(self.terms.take(few, axis=1), lean)
 
+    def moments(self, slab: Slab, lean: FloatArray) -> FloatArray:
+        rest = _rest(self.terms, lean) if lean.any() else self.terms[1]
+        apart = np.abs(rest)
+        apart[self.disputed] = np.inf
+        inside = apart < np.float32(GATE_SIGMAS * slab.sigma_m)
+        inside &= self.held
+        return np.asarray((self.terms * inside.astype(np.float32)) @ self.terms.T)
+
     def only(self, keep: BoolArray) -> _Terms:
         return replace(self, held=self.held & keep)
 
@@ -190,10 +202,11 @@ class _Terms:
 @dataclass(frozen=True, eq=False)
 class _Positions:
     """Claims as kernels make them: positions `index` (M,) in a block with the points `columns` (3, N) from number
-    `first` on; what else is known of them is worked out if it is asked for."""
+    `first` on, which `times` (N,) say how many hold; what else is known of them is worked out if it is asked for."""
 
     slab: Slab
     columns: Float32Array
+    times: NDArray[np.uint8]
     first: int
     index: NDArray[np.uint32]
     disputed: NDArray[np.integer]
@@ -225,10 +238,19 @@ class _Positions:
         row = self.slab.turned(lean).astype(np.float32)
         return np.asarray(heights_of_some(self.columns, self.index, _runs(every, RUN), row))
 
+    def moments(self, slab: Slab, lean: FloatArray) -> FloatArray:
+        from lidarpose.detect.plane_kernels import moments_of
+
+        rows, gate_m = slab.rows[1:].astype(np.float32), GATE_SIGMAS * slab.sigma_m
+        return np.asarray(moments_of(self.columns, self.index, self.times, rows, lean, gate_m, _NONE)[0])
+
     def only(self, keep: BoolArray) -> _Positions:
         disputed = np.zeros(len(keep), dtype=bool)
         disputed[self.disputed] = True
         return replace(self, index=self.index[keep], disputed=np.flatnonzero(disputed[keep]))
+
+
+_NONE = np.zeros(0, dtype=np.uint32)
 
 
 @lru_cache(maxsize=64)
@@ -237,16 +259,7 @@ def _runs(every: int, run: int) -> BoolArray:
     return np.asarray(np.arange(BLOCK) // run % (every | 1) == 0)
 
 
-def _moments(claims: _Claims, rest: Float32Array, sigma_m: float) -> Float32Array:
-    """Sums (4, 4) of the terms' products within the gate and outside of seams, by the points' heights (M,)."""
-    apart = np.abs(rest)
-    apart[claims.disputed] = np.inf
-    inside = apart < np.float32(GATE_SIGMAS * sigma_m)
-    inside &= claims.held
-    return np.asarray((claims.terms * inside.astype(np.float32)) @ claims.terms.T)
-
-
-_Part = tuple[_Claims, Float32Array]
+_Part = tuple[_Claims, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,8 +297,13 @@ class Ahead:
     """A cloud's blocks as the kernels want them, prepared by a thread of its own while a subsample is searched."""
 
     def __init__(self, x: NDArray[np.floating]) -> None:
+        blocks = _blocks(x)
+        # One array: large ones come in large pages.
+        whole = np.empty((len(blocks) - 1, 3, BLOCK), dtype=np.float32)
+        last = np.empty((3, len(x[blocks[-1]])), dtype=np.float32)
+        self._columns: list[Float32Array] = [*whole, last]
         pool = ThreadPoolExecutor(1)
-        self._columns = [pool.submit(_columns, x[block]) for block in _blocks(x)]
+        self._filled = [pool.submit(_fill, x[b], c) for b, c in zip(blocks, self._columns, strict=True)]
         pool.shutdown(wait=False)
 
     @staticmethod
@@ -295,14 +313,15 @@ class Ahead:
 
     def columns(self, block: slice) -> Float32Array:
         """Points of a block as rows (3, N)."""
-        columns: Float32Array = self._columns[block.start // BLOCK].result()
-        return columns
+        k = block.start // BLOCK
+        self._filled[k].result()
+        return self._columns[k]
 
 
-def _columns(points: NDArray[np.floating]) -> Float32Array:
-    from lidarpose.detect.plane_kernels import columns_of
+def _fill(points: NDArray[np.floating], columns: Float32Array) -> None:
+    from lidarpose.detect.plane_kernels import fill_columns
 
-    return np.asarray(columns_of(np.ascontiguousarray(points)))
+    fill_columns(np.ascontiguousarray(points), columns)
 
 
 def _blocks(x: NDArray[np.floating]) -> list[slice]:
@@ -387,7 +406,7 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
     parts: list[_Part] = []
     for slab, (indices, terms, held, doubtful) in zip(slabs, found, strict=True):
         claims = _Terms(indices + block.start, terms, held, doubtful[times[indices[doubtful]] > 1])
-        parts.append((claims, _moments(claims, terms[1], slab.sigma_m)))
+        parts.append((claims, claims.moments(slab, np.zeros(3))))
     return parts
 
 
@@ -407,14 +426,14 @@ def _compiled_claims(ahead: Ahead, free: BoolArray | None, slabs: Sequence[Slab]
     def claim(block: slice) -> list[_Part]:
         columns = ahead.columns(block)
         of_block = all_free if free is None else free[block]
-        held, ends, disputed, theirs, moments = claims_of_block(
+        held, ends, disputed, theirs, moments, times = claims_of_block(
             columns, of_block, single, allowed, starts, widths, gates
         )
         parts: list[_Part] = []
         first = first_disputed = 0
         for k, slab in enumerate(slabs):
             mine, doubtful = held[first : ends[k]], disputed[first_disputed : theirs[k]]
-            parts.append((_Positions(slab, columns, block.start, mine, doubtful), moments[k]))
+            parts.append((_Positions(slab, columns, times, block.start, mine, doubtful), moments[k]))
             first, first_disputed = ends[k], theirs[k]
         return parts
 
@@ -434,7 +453,7 @@ def _screened(slab: Slab, parts: Sequence[_Part]) -> Sequence[_Part]:
         around += np.bincount(cell[claims.held & ~near], minlength=len(inside))
     solid = inside > STANDS_OUT * (inside + around)
     kept = [claims.only(solid[cell]) for (claims, _), cell in zip(parts, cells, strict=True)]
-    return [(claims, _moments(claims, claims.terms[1], slab.sigma_m)) for claims in kept]
+    return [(claims, claims.moments(slab, np.zeros(3))) for claims in kept]
 
 
 def _cluttered(parts: Sequence[_Part]) -> bool:
@@ -468,7 +487,7 @@ def _fit(slab: Slab, parts: Sequence[_Part], widest_m: float) -> _Fit | None:
         limit = SMALL_STEP if count < FEW_POINTS else near_enough
         if step @ plain @ step < (limit * slab.sigma_m) ** 2:
             break
-        sums = [_moments(claim, _rest(claim.terms, lean), slab.sigma_m) for claim in claims]
+        sums = [claim.moments(slab, lean) for claim in claims]
     every = int(count) // SPREAD_POINTS + 1
     rest = np.concatenate([claim.some_rest(every, lean) for claim in claims])
     rest = rest[np.abs(rest) < GATE_SIGMAS * slab.sigma_m]

@@ -17,13 +17,11 @@ from lidarpose.geometry.compiled import kernel
 
 
 @kernel
-def columns_of(points: Any) -> Any:
+def fill_columns(points: Any, columns: Any) -> None:
     """Points (N, 3) as rows (3, N) in single precision."""
-    columns = np.empty((3, len(points)), np.float32)
     x, y, z = columns[0], columns[1], columns[2]
     for i in range(len(points)):
         x[i], y[i], z[i] = points[i, 0], points[i, 1], points[i, 2]
-    return columns
 
 
 @kernel
@@ -65,9 +63,15 @@ def _hold(x: Any, y: Any, z: Any, rows: Any, near: Any, width: int, allowed: Any
 
 
 @kernel
-def _moments(x: Any, y: Any, z: Any, rows: Any, index: Any, times: Any, gate: float, disputed: Any, sums: Any) -> int:
-    """Sum products of (1, height, u, v) over points within the gate that nobody else holds; write positions of the
-    others in `index` to `disputed`, and say how many there are."""
+def moments_of(columns: Any, index: Any, times: Any, rows: Any, lean: Any, gate: float, disputed: Any) -> Any:
+    """The sums (4, 4) of products of (1, height, u, v) over those of the points (3, N) at `index` that nobody else
+    holds and whose height over the leant plane is within the gate, and how many others there are.
+
+    `times` (N,) says how many hold each point; positions in `index` of those with several are written to `disputed`,
+    unless that is empty.
+    """
+    x, y, z = columns[0], columns[1], columns[2]
+    lean_1, lean_u, lean_v = lean[0], lean[1], lean[2]
     h_x, h_y, h_z, h_1 = rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3]
     u_x, u_y, u_z, u_1 = rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3]
     v_x, v_y, v_z, v_1 = rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3]
@@ -76,13 +80,14 @@ def _moments(x: Any, y: Any, z: Any, rows: Any, index: Any, times: Any, gate: fl
     for j in range(len(index)):
         i = np.uint64(index[j])
         if times[i] > 1:
-            disputed[disputes] = j
+            if len(disputed) > 0:
+                disputed[disputes] = j
             disputes += np.uint64(1)
             continue
         h = np.float64(h_x * x[i] + h_y * y[i] + h_z * z[i] + h_1)
-        if abs(h) < gate:
-            u = np.float64(u_x * x[i] + u_y * y[i] + u_z * z[i] + u_1)
-            v = np.float64(v_x * x[i] + v_y * y[i] + v_z * z[i] + v_1)
+        u = np.float64(u_x * x[i] + u_y * y[i] + u_z * z[i] + u_1)
+        v = np.float64(v_x * x[i] + v_y * y[i] + v_z * z[i] + v_1)
+        if abs(h - lean_1 - lean_u * u - lean_v * v) < gate:
             s_1 += 1.0
             s_h += h
             s_u += u
@@ -93,15 +98,16 @@ def _moments(x: Any, y: Any, z: Any, rows: Any, index: Any, times: Any, gate: fl
             s_uu += u * u
             s_uv += u * v
             s_vv += v * v
+    sums = np.empty((4, 4))
     sums[0, 0], sums[1, 1], sums[2, 2], sums[3, 3] = s_1, s_hh, s_uu, s_vv
     sums[0, 1], sums[0, 2], sums[0, 3], sums[1, 2], sums[1, 3], sums[2, 3] = s_h, s_u, s_v, s_hu, s_hv, s_uv
     sums[1, 0], sums[2, 0], sums[3, 0], sums[2, 1], sums[3, 1], sums[3, 2] = s_h, s_u, s_v, s_hu, s_hv, s_uv
-    return int(disputes)
+    return sums, int(disputes)
 
 
 @kernel
 def claims_of_block(columns: Any, free: Any, rows: Any, allowed: Any, starts: Any, widths: Any, gates: Any) -> Any:
-    """What each of K slabs holds of a block of points (N, 3), of those with `free` (N,), or of all where that is empty.
+    """What each of K slabs holds of a block of points (3, N), of those with `free` (N,), or of all where that is empty.
 
     Parameters
     ----------
@@ -114,8 +120,8 @@ def claims_of_block(columns: Any, free: Any, rows: Any, allowed: Any, starts: An
 
     Returns
     -------
-    Positions of what is held, slab after slab, and where each slab's end
-    (K,); the disputed ones among each slab's, and where those end (K,); the moments (K, 4, 4).
+    Positions of what is held, slab after slab, and where each slab's end (K,); the disputed ones among each slab's, and
+    where those end (K,); the moments (K, 4, 4); how many hold each point (N,).
     """
     x, y, z = columns[0], columns[1], columns[2]
     n, slabs = len(x), len(rows)
@@ -137,13 +143,14 @@ def claims_of_block(columns: Any, free: Any, rows: Any, allowed: Any, starts: An
         ends[k] = total
     disputed, disputes, first = np.empty(total, np.uint32), 0, 0
     sums = np.zeros((slabs, 4, 4))
-    scaled = rows.copy()
+    scaled, level = rows.copy(), np.zeros(3)
     for k in range(slabs):
         scaled[k, 0] *= np.float32(gates[k, 0])
         mine = held[first : ends[k]]
-        disputes += _moments(x, y, z, scaled[k], mine, times, gates[k, 1], disputed[disputes:], sums[k])
+        sums[k], others = moments_of(columns, mine, times, scaled[k], level, gates[k, 1], disputed[disputes:])
+        disputes += others
         first, disputed_ends[k] = ends[k], disputes
-    return held[:total].copy(), ends, disputed[:disputes].copy(), disputed_ends, sums
+    return held[:total].copy(), ends, disputed[:disputes].copy(), disputed_ends, sums, times
 
 
 @kernel
