@@ -315,7 +315,8 @@ class Ahead:
         """Points of a block as rows (3, N)."""
         k = block.start // BLOCK
         self._filled[k].result()
-        return self._columns[k]
+        columns: Float32Array = self._columns[k]
+        return columns
 
 
 def _fill(points: NDArray[np.floating], columns: Float32Array) -> None:

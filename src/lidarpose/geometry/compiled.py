@@ -9,7 +9,7 @@ and one by kernels asks `pays` each time, and says how much sooner the kernels w
   who rent skis until they have paid the price of a pair. One run costs at most twice what it would have cost by the
   better of both ways, and a process that goes on comes to the kernels by itself.
 
-Both ways give the same answer, so that it does not matter which one ran.
+Both ways give the same answer, to the bit or to its rounding, so that it does not matter which one ran.
 
 A module of kernels imports `kernel` from here, and is itself imported only where `pays` has said yes.
 """
