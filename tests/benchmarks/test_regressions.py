@@ -154,14 +154,14 @@ CLOUD_BYTES = CLOUD.points.nbytes
 GATES = {
     "assembling half a million points": Gate(lambda: assembling_sweeps(500), 650, 10_000_000),
     "assembling five million points": Gate(lambda: assembling_sweeps(5000), 2_350, 75_000_000),
-    "three planes of 60 k points": Gate(lambda: finding_planes(60_000), 7_000, 12_500_000),
-    "three planes of 240 k points": Gate(lambda: finding_planes(240_000), 11_500, 16_000_000),
+    "three planes of 60 k points": Gate(lambda: finding_planes(60_000), 7_000, 4_000_000),
+    "three planes of 240 k points": Gate(lambda: finding_planes(240_000), 11_500, 12_000_000),
     "the closed form of 15 places": Gate(lambda: solving(15), 69_500),
     "the joint estimate of 15 places": Gate(lambda: refining(15), 111_500, 6_800_000),
     "both boards": Gate(finding_boards, 23_000, 20_000_000),
     "a stripe image": Gate(finding_a_stripe, 13_300, 1_700_000),
     "eight stripe images": Gate(finding_stripes, 27_200, 6_100_000),
-    "the world pose from six frames": Gate(frames, 260_000, 100_000_000),
+    "the world pose from six frames": Gate(frames, 70_000, 40_000_000),
 }
 
 

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -87,6 +88,21 @@ print(twice(3.0), twice.stats.cache_path)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["6.0", "None"]
     assert done.stderr == ""
+
+
+def test_where_kernels_go_is_asked_of_the_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    writable: set[Path] = set()
+    monkeypatch.setattr(compiled.os, "access", lambda folder, mode: Path(folder) in writable)
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert not compiled._can_store()
+    writable.add(tmp_path)
+    assert compiled._can_store()
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError))
+    assert not compiled._can_store()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    assert compiled._can_store()
 
 
 def test_asking_for_little_imports_nothing() -> None:

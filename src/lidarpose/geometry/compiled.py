@@ -112,7 +112,10 @@ def _can_store() -> bool:
     if os.environ.get("NUMBA_CACHE_DIR"):
         return True
     beside = Path(__file__).parent
-    cache = os.environ.get("XDG_CACHE_HOME") or str(Path("~").expanduser() / ".cache")
+    try:
+        cache = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    except RuntimeError:  # a user without a home
+        cache = os.devnull
     # A folder that is not there yet is made where its parent can be written to.
     choices = ((beside / "__pycache__", beside), (Path(cache) / "numba", Path(cache), Path(cache).parent))
     nearest = (next((folder for folder in folders if folder.is_dir()), None) for folders in choices)
