@@ -461,8 +461,10 @@ def _without_effects(lines: Lines, residuals: LineResiduals, effects: LineEffect
 
 def _less(lines: Lines, residuals: LineResiduals, of_line: FloatArray) -> FloatArray:
     """Residuals (N,) less a shift and a slope (S, 2) of their lines."""
-    shift = of_line[lines.line_of_row]
-    return np.asarray(residuals.residual - shift[:, 0] - SQRT3 * lines.along * shift[:, 1])
+    row = lines.line_of_row
+    out = lines.along * (SQRT3 * of_line[:, 1])[row]
+    out += of_line[:, 0][row]
+    return np.asarray(np.subtract(residuals.residual, out, out=out))
 
 
 def update_noise(
@@ -538,9 +540,11 @@ def _update_lines(
     # Full weights within a line that was dropped: whether it stays out must not depend on its being out.
     row_weights[dropped] = 1.0
     correction = 1.0 if soft else information_correction(z[use] / factor, used_weights)
-    by_line, good = own_effects(moments)
-    psi = np.where(use & good[lines.line_of_row], row_weights * _less(lines, residuals, by_line) / lines.sigma, 0.0)
-    as_one = rows_that_count_as_one(psi, lines.line_of_row, 2.0 * lines.count)
+    as_one = noise.rows_as_one
+    if with_places:
+        by_line, good = own_effects(moments)
+        psi = np.where(use & good[lines.line_of_row], row_weights * _less(lines, residuals, by_line) / lines.sigma, 0.0)
+        as_one = rows_that_count_as_one(psi, lines.line_of_row, 2.0 * lines.count)
     return LineNoise(
         factor, variance, row_weights, line_weights, correction, noise.neighbour_factor, as_one, places.certainty_factor
     )
