@@ -107,3 +107,43 @@ def test_the_mount_is_no_plane_in_a_dense_cloud_either() -> None:
     assert sum(len(p) > 9000 for p in patches) == 6
     for patch in patches:
         assert np.count_nonzero(mount[patch.indices]) < 0.05 * np.count_nonzero(mount)
+
+
+def sagging_floor(count: int, sag_m: float) -> FloatArray:
+    """A floor of 4 x 4 m, 1.5 m below the sensor, that sags in the middle, and a wall; noise of 3 mm across."""
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(0.5, 4.5, count), rng.uniform(-2.0, 2.0, count)
+    z = -1.5 - sag_m * np.sin(np.pi * (x - 0.5) / 4.0) + rng.normal(0.0, 0.003, count)
+    wall = np.column_stack(
+        [
+            4.5 + rng.normal(0.0, 0.003, count // 2),
+            rng.uniform(-2.0, 2.0, count // 2),
+            rng.uniform(-1.4, 1.0, count // 2),
+        ]
+    )
+    return np.concatenate([np.column_stack([x, y, z]), wall])
+
+
+@pytest.mark.parametrize("count", [20_000, 200_000])
+def test_a_bent_surface_is_found_whole_if_asked_for(count: int) -> None:
+    points = sagging_floor(count, 0.03)
+    for seed in range(3):
+        pieces = segment_planes(points, PlaneSearch(from_sensor=True, seed=seed))
+        whole = segment_planes(points, PlaneSearch(from_sensor=True, seed=seed, bent=True))
+        share = [max(np.count_nonzero(p.indices < count) for p in found) / count for found in (pieces, whole)]
+        assert share[0] < 0.8
+        assert share[1] > 0.9
+        floor = max(whole, key=lambda p: np.count_nonzero(p.indices < count))
+        assert np.degrees(np.arccos(abs(floor.plane.normal[2]))) < 0.5
+        assert (np.diff(floor.indices) > 0).all()
+        assert len(np.unique(np.concatenate([p.indices for p in whole]))) == sum(len(p) for p in whole)
+
+
+@pytest.mark.parametrize("count", [20_000, 200_000])
+def test_flat_surfaces_are_found_as_ever_if_bent_ones_are_asked_for(count: int) -> None:
+    points = sagging_floor(count, 0.0)
+    plain = segment_planes(points, PlaneSearch(from_sensor=True))
+    asked = segment_planes(points, PlaneSearch(from_sensor=True, bent=True))
+    assert len(plain) == len(asked)
+    for a, b in zip(plain, asked, strict=True):
+        np.testing.assert_array_equal(a.indices, b.indices)

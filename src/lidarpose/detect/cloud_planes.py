@@ -54,8 +54,11 @@ GATE_SIGMAS = 3.0
 MIN_SIGMA_M = 2e-4
 # A patch spreads more than its neighbourhoods say, by up to this factor; a wider slab would take in two surfaces.
 WIDEST = 3.0
-# Patches that spread by this factor more than neighbouring points are of bent surfaces.
-BENT = 1.8
+# Patches that spread by this factor more than neighbouring points are of bent surfaces: flat ones spread up to twice as
+# much as the thinnest fifth of neighbourhoods, and none more than three times.
+BENT = 2.3
+# The share of the points found that patches of bent surfaces hold where those are wanted whole.
+BENT_SHARE = 1.0 / 3.0
 # Of the voxels within twice a patch's thickness, the share that lies within it; and its thickness over its width.
 STANDS_OUT = 0.7
 THIN = 0.15
@@ -87,8 +90,8 @@ class PlaneSearch:
         Planes tried on each subsample.
     bent
         Surfaces that are not flat to the noise, as of most buildings and of clouds put together a little wrong, are
-        wanted whole. Where the patches found spread much more than neighbouring points do, the search begins again at
-        their own scale. Without it they come in pieces, each as flat as neighbours are.
+        wanted whole. Where many patches spread far more than neighbouring points do, the search begins again at their
+        own scale. Without it they come in pieces, each as flat as neighbours are.
     """
 
     max_planes: int = 40
@@ -169,8 +172,10 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
             found, near_m = _harvest(x, free, sample, least, at_most), sample.sigma_m
         if not found:
             break
-        if not settled and _typical_spread(found) > BENT * near_m:
-            settled, sigma_m = True, _typical_spread(found)
+        if not settled and _mostly_bent(found, near_m):
+            if len(x) > DENSE:
+                return _bent_patches(x, search, least, rng)
+            settled, sigma_m = True, WIDEST * near_m
             free[:] = True
             continue
         settled = True
@@ -227,12 +232,38 @@ def _harvest_dense(
     return found, sample.sigma_m
 
 
-def _typical_spread(patches: list[PlanePatch]) -> float:
-    """The spread of the patches that half of the points on any have at least."""
-    spread = np.array([p.sigma_m for p in patches])
-    order = np.argsort(spread)
-    points = np.cumsum([len(patches[k]) for k in order])
-    return float(spread[order[np.searchsorted(points, 0.5 * points[-1])]])
+def _bent_patches(
+    x: NDArray[np.floating], search: PlaneSearch, least: int, rng: np.random.Generator
+) -> tuple[PlanePatch, ...]:
+    """Bent surfaces of a dense cloud: found in a part of its points, and then all their points.
+
+    The planes stay as found: what is not flat to its noise has no optimum that a step from there leads to.
+    """
+    chosen = _one_of_each(len(x), DENSE // 2, rng)
+    few = x[chosen].astype(np.float32)
+    fewest = max(int(least * len(few) / len(x)), FEWEST_OF_SAMPLE)
+    seen = segment_planes(few, replace(search, min_points=fewest, min_share=0.0))
+    free = np.ones(len(x), dtype=bool)
+    patches = []
+    for found in seen:
+        points = few[found.indices]
+        raster, cells = raster_of(points, found.plane, cell_size_m(points), 1)
+        occupied = np.zeros(raster.shape[0] * raster.shape[1] + 1, dtype=bool)
+        occupied[cells] = True
+        occupied[-1] = False
+        height = x @ found.plane.normal.astype(x.dtype) - x.dtype.type(found.plane.offset)
+        near = np.flatnonzero((np.abs(height) < GATE_SIGMAS * found.sigma_m) & free)
+        mine = near[occupied[raster.cells(x[near])]]
+        if len(mine) >= least:
+            free[mine] = False
+            patches.append(PlanePatch(found.plane, mine, found.sigma_m))
+    return tuple(patches)
+
+
+def _mostly_bent(patches: list[PlanePatch], near_m: float) -> bool:
+    """Whether patches that spread far more than neighbouring points, which tell too little of it, hold a good share."""
+    bent = sum(len(p) for p in patches if p.sigma_m > BENT * near_m)
+    return bent > BENT_SHARE * sum(map(len, patches))
 
 
 def _one_of_each(count: int, parts: int, rng: np.random.Generator) -> IntArray:
