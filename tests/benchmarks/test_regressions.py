@@ -29,8 +29,11 @@ from lidarpose.measure.assemble import assemble
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.image import GrayImage, ImageSource
 from lidarpose.model.observation import TurntableObservations
+from lidarpose.model.recording import SweepRecording
 from lidarpose.model.session import TurntableSession
+from lidarpose.model.turntable import TurntableMotion
 from lidarpose.refine import turntable_joint
+from lidarpose.refine.least_squares import line_moments
 from lidarpose.refine.turntable import JointOptions, refine_turntable
 from lidarpose.simulate.corner_scene import CornerSceneSpec, simulate_corner_session
 from lidarpose.simulate.observations import simulate_observations
@@ -298,9 +301,9 @@ def hypothesis_by_hypothesis(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def line_by_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """Moments of lines summed point by point."""
-    together = turntable_joint.line_moments
+    together = line_moments
 
-    def point_by_point(columns: np.ndarray, weight: np.ndarray, start: np.ndarray):
+    def point_by_point(columns: np.ndarray, weight: np.ndarray, start: np.ndarray) -> object:
         out = together(columns, weight, start)
         for row in columns:
             np.outer(row, row)
@@ -326,7 +329,7 @@ def one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(StripeFinder, "find_in", lambda self, images: [together(self, [image]) for image in images])
 
 
-def by_einsum(recording: object, motion: object, points: np.ndarray) -> Callable[[int, int], None]:
+def by_einsum(recording: SweepRecording, motion: TurntableMotion, points: np.ndarray) -> Callable[[int, int], None]:
     """Eq. (28) by full matrices for every point, in double precision: measured 10 to 13."""
     origins, directions = assembling.beam_origins_and_directions(motion, recording)
 

@@ -92,6 +92,11 @@ def same_angle(text: str) -> str:
     return "\n".join(",".join(row) for row in rows) + "\n"
 
 
+def hide_panel_stripes(paths: list[Path], bright: Path) -> None:
+    for path in paths:
+        hide_panel_stripe(path, bright, left=True)
+
+
 FLAWS: dict[str, tuple[Callable[[Path], object], int, str]] = {
     "a missing image": (lambda s: (s / "stripes/001.png").unlink(), 2, "stripes/001.png"),
     "a scan file of no bytes": (lambda s: (s / "scans/002.csv").write_bytes(b""), 2, "scans/002.csv: line 1: is empty"),
@@ -110,7 +115,7 @@ FLAWS: dict[str, tuple[Callable[[Path], object], int, str]] = {
     "only two places": (lambda s: keep_rows(s, 2), 1, "three"),
     "no stripe": (lambda s: blank_images(sorted((s / "stripes").glob("*.png"))), 1, "stripe"),
     "a stripe on one panel": (
-        lambda s: [hide_panel_stripe(p, s / "board/00.png", left=True) for p in sorted((s / "stripes").glob("*.png"))],
+        lambda s: hide_panel_stripes(sorted((s / "stripes").glob("*.png")), s / "board/00.png"),
         1,
         "panel",
     ),

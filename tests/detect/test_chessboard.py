@@ -40,8 +40,8 @@ def test_a_board_that_moved_between_shots_is_named_with_its_shift(two_panels) ->
 
 
 @pytest.mark.parametrize("low_high", [(90, 110), (0, 255), (0, 1), (255, 256)], ids=["grey", "noise", "black", "white"])
-def test_an_image_without_boards_names_the_missing_panel(low_high) -> None:
-    empty = np.random.default_rng(3).integers(*low_high, (480, 640)).astype(np.uint8)
+def test_an_image_without_boards_names_the_missing_panel(low_high: tuple[int, int]) -> None:
+    empty = np.random.default_rng(3).integers(low_high[0], low_high[1], (480, 640)).astype(np.uint8)
     with pytest.raises(BoardNotFoundError, match="7 x 5 inner corners; no chessboard was found at all") as caught:
         find_panels([empty], [Panel(7, 5, 0.02), Panel(7, 5, 0.02)])
     assert caught.value.panel == 0

@@ -149,9 +149,12 @@ def test_stated_errors_are_true_on_a_simulated_session() -> None:
     centres = [rig.camera.project(T.translation) for T in rig.T_camera_panel[""]]
     standardised = []
     for place in (1, 3):
-        for k, points in finder.find(session.places[place].stripe_image.load()).stripes.items():
+        source = session.places[place].stripe_image
+        assert source is not None
+        for k, points in finder.find(source.load()).stripes.items():
             panel = int(np.argmin([np.linalg.norm(c - board.corners[k].pixels, axis=1).min() for c in centres]))
             ends = rig.chord(place, panel)
+            assert ends is not None
             along = ends[0] + np.linspace(-0.05, 1.05, 8001)[:, None] * (ends[1] - ends[0])
             line = rig.camera.project(rig.T_camera_panel[""][panel] @ along)
             nearest = np.argmin(((points.pixels[:, None] - line[None]) ** 2).sum(-1), axis=1)

@@ -62,12 +62,12 @@ def look(room: Room, angles: FloatArray, rng: np.random.Generator, sigma: float)
             share = (r[:, None] * beams - a) @ (b - a) / ((b - a) @ (b - a))
             hit = (r > 0) & (share >= 0) & (share <= 1) & (r < ranges)
             ranges[hit], owner[hit] = r[hit], k
-        for k, (x, y, radius) in enumerate(room.poles):
+        for pole, (x, y, radius) in enumerate(room.poles):
             along = beams @ [x, y]
             r = along - np.sqrt(along**2 - (x * x + y * y - radius**2))
             hit = (r > 0) & (r < ranges)
-            ranges[hit], owner[hit] = r[hit], POLE + k
-    for k in np.flatnonzero(np.diff(owner)):
+            ranges[hit], owner[hit] = r[hit], POLE + pole
+    for k in np.flatnonzero(np.diff(owner)).tolist():
         if rng.random() < 0.6:
             share = rng.random()
             ranges[k], owner[k] = share * ranges[k] + (1 - share) * ranges[k + 1], MIXED

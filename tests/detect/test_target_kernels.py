@@ -1,5 +1,7 @@
 """Cutting out the target and telling its faces' beams: kernels and NumPy select the same."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -60,7 +62,7 @@ def test_the_same_beams_are_of_each_face(convex: bool, gate_m: float) -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_same_points_are_in_a_box(dtype: type) -> None:
+def test_the_same_points_are_in_a_box(dtype: type[np.floating[Any]]) -> None:
     rng = np.random.default_rng(6)
     points = rng.uniform(-4.0, 4.0, (20_000, 3)).astype(dtype)
     points[::7] = np.nan
@@ -82,7 +84,7 @@ def test_the_same_points_are_in_a_box(dtype: type) -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_same_points_have_moved(dtype: type) -> None:
+def test_the_same_points_have_moved(dtype: type[np.floating[Any]]) -> None:
     """Frames of a box as large as a room, a small cloud that stands elsewhere in each, and points out of reach."""
     rng = np.random.default_rng(7)
     frames = []

@@ -100,7 +100,8 @@ def test_point_sigma_joins_calibration_and_range_noise() -> None:
         step = root @ rng.normal(size=10)
         turned = Pose(Pose.exp(np.r_[np.zeros(3), step[7:]]).rotation @ motion.T_turntable_lidar.rotation, np.zeros(3))
         moved = TurntableMotion(
-            Pose.exp(step[:6]) @ motion.T_camera_turntable, Pose(turned.rotation, [motion.radius_m + step[6], 0.0, 0.0])
+            Pose.exp(step[:6]) @ motion.T_camera_turntable,
+            Pose(turned.rotation, np.array([motion.radius_m + step[6], 0.0, 0.0])),
         )
         noisy = replace(recording, range_m=recording.range_m + np.float64(0.002) * rng.normal())
         samples.append(assemble(noisy.part(i, i + 1), moved, dtype=np.float64)[0, j])
@@ -127,7 +128,7 @@ def test_point_sigma_holds_further_parameters() -> None:
         turned = Pose.exp(np.r_[np.zeros(3), step[7:10]]).rotation @ motion.T_turntable_lidar.rotation
         moved = TurntableMotion(
             Pose.exp(step[:6]) @ motion.T_camera_turntable,
-            Pose(turned, [motion.radius_m + step[6], 0.0, 0.0]),
+            Pose(turned, np.array([motion.radius_m + step[6], 0.0, 0.0])),
             motion.reading_scale + step[10],
             motion.reading_origin_rad,
         )

@@ -34,8 +34,9 @@ def calibrate(boards, panel: Panel, size: tuple[int, int]) -> Camera:
     """Intrinsics from the boards themselves, where the recording has none."""
     object_points = [panel.corners_panel().astype(np.float32)] * len(boards)
     image_points = [board.corners[0].pixels.astype(np.float32)[:, None] for board in boards]
-    _, K, distortion, _, _ = cv2.calibrateCamera(object_points, image_points, size, None, None, flags=cv2.CALIB_FIX_K3)
-    return Camera(*size, K, "plumb_bob", distortion.ravel()[:5])
+    start, none = np.eye(3), np.zeros(5)
+    _, K, distortion, _, _ = cv2.calibrateCamera(object_points, image_points, size, start, none, flags=cv2.CALIB_FIX_K3)
+    return Camera(*size, np.asarray(K, dtype=float), "plumb_bob", np.asarray(distortion, dtype=float).ravel()[:5])
 
 
 def stripe_in_space(camera: Camera, board, bright, image):
@@ -76,7 +77,9 @@ def test_published_light_plane_is_met() -> None:
     text = (here / "Calib_Results.m").read_text(encoding="latin-1")
 
     def numbers(key: str):
-        return [float(x) for x in re.search(rf"^{key} = \[(.*?)\]", text, re.M).group(1).split(";")]
+        found = re.search(rf"^{key} = \[(.*?)\]", text, re.M)
+        assert found is not None, key
+        return [float(x) for x in found.group(1).split(";")]
 
     (fx, fy), (cx, cy) = numbers("fc"), numbers("cc")
     camera = Camera(782, 582, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), "plumb_bob", np.array(numbers("kc")))

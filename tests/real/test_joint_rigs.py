@@ -26,6 +26,12 @@ from lidarpose.solve.panel_pose import panel_pose
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
+def grey(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None, path
+    return image
+
+
 def folder(name: str) -> Path:
     if not (DATA / name).is_dir():
         pytest.skip(f"real recordings are not here: {DATA / name}")
@@ -137,7 +143,7 @@ def rows_of_lcct(points: np.ndarray, every: int) -> list[np.ndarray]:
 def test_lcct_turns_about_its_own_axis() -> None:
     data = folder("lcct_cmu")
     camera = toolbox_camera(data / "sample_results" / "Calib_Results.m", (640, 480))
-    images = [cv2.imread(str(data / "sample_data" / f"img_target{k}.jpg"), cv2.IMREAD_GRAYSCALE) for k in range(1, 10)]
+    images = [grey(data / "sample_data" / f"img_target{k}.jpg") for k in range(1, 10)]
     clouds = [board_of_lcct(np.loadtxt(data / "sample_data" / f"laser_target{k}.xyz")) for k in range(1, 10)]
     estimate, _ = estimate_rig(camera, Panel(7, 5, 0.030), images, [rows_of_lcct(c, 4) for c in clouds])
     assert estimate.converged
@@ -166,7 +172,7 @@ def test_sweep_fits_as_well_as_planes_do() -> None:
     data = folder("sweep_suijingfeng")
     camera = toolbox_camera(data / "Calib_Results_left.m", (1280, 720))
     names = ["05", "06", "10", "13", "15", "17"]
-    images = [cv2.imread(str(data / f"left_{n}.png"), cv2.IMREAD_GRAYSCALE) for n in names]
+    images = [grey(data / f"left_{n}.png") for n in names]
     # The scanner tilts about its x: with x named z, and y and z moved up, it turns about z like a turntable.
     boards = [[row[:, [1, 2, 0]] for row in rows_of_sweep(data / f"plane_{n}.pcd", 12)] for n in names]
     estimate, aligned = estimate_rig(camera, Panel(8, 6, 0.0775), images, boards)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lidarpose.errors import UndeterminedError
+from lidarpose.model.rig_family import Family
 from lidarpose.refine.prediction import ExpectedNoise, predict_uncertainty
 from lidarpose.refine.turntable import refine_turntable
 from lidarpose.simulate.observations import simulate_observations
@@ -14,7 +15,7 @@ from lidarpose.simulate.rig import draw_rig
 
 
 @pytest.mark.parametrize("family", ["paper", "far-axis"])
-def test_prediction_agrees_with_the_estimate(family: str) -> None:
+def test_prediction_agrees_with_the_estimate(family: Family) -> None:
     rig = draw_rig(3, family=family, places=12)
     estimate = refine_turntable(simulate_observations(rig, seed=1), rig.motion, rig.T_camera_panel)
     predicted = predict_uncertainty(

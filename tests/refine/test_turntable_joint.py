@@ -10,6 +10,7 @@ import pytest
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.observation import TurntableObservations
+from lidarpose.model.rig_family import Family
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_result import TurntableEstimate
 from lidarpose.refine.turntable import JointOptions, refine_turntable
@@ -47,7 +48,7 @@ def errors(estimate: TurntableEstimate, rig: TurntableRig, reading: float) -> tu
 
 
 @pytest.mark.parametrize("family", ["paper", "mixed", "flat-scan-plane", "far-axis"])
-def test_exact_data_give_the_exact_answer(family: str) -> None:
+def test_exact_data_give_the_exact_answer(family: Family) -> None:
     rig = draw_rig(4, family=family, places=6)
     observations = simulate_observations(
         rig, corner_sigma_px=0.0, stripe_sigma_px=0.0, range_sigma_m=0.0, stripe_step_px=20.0

@@ -1,11 +1,13 @@
 """The measurement model against numerical derivatives and against the simulator's independent geometry."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
 
 from lidarpose.geometry.se3 import Pose
+from lidarpose.model.rig_family import Family
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.refine.turntable_joint import linearise, lines_of
 from lidarpose.refine.turntable_layout import JointData, lay_out, thinned
@@ -24,7 +26,7 @@ def exact(rig: TurntableRig) -> tuple[JointData, JointState]:
 
 
 @pytest.mark.parametrize("family", ["paper", "mixed", "flat-scan-plane", "axis-in-scan-plane"])
-def test_residuals_vanish_on_exact_observations(family: str) -> None:
+def test_residuals_vanish_on_exact_observations(family: Family) -> None:
     data, state = exact(draw_rig(3, family=family, places=4))
     at = linearise(data, state)
     assert np.abs(at.lines["stripes"].residual).max() < 1e-6
@@ -35,7 +37,7 @@ def test_residuals_vanish_on_exact_observations(family: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["stripes", "ranges"])
-def test_line_jacobians_equal_numerical_ones(kind: str) -> None:
+def test_line_jacobians_equal_numerical_ones(kind: Literal["stripes", "ranges"]) -> None:
     data, state = exact(draw_rig(5, family="mixed", places=4, placements=2))
     here = linearise(data, state).lines[kind]
     lines = lines_of(data, kind)

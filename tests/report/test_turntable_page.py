@@ -207,7 +207,7 @@ class _MissingScan:
         raise InputError(self.name, "is missing")
 
 
-def _with_estimate(run: TurntableRun, **changes: object) -> TurntableRun:
+def _with_estimate(run: TurntableRun, **changes: Any) -> TurntableRun:
     assert run.estimate is not None
     return replace(run, estimate=replace(run.estimate, **changes))
 

@@ -48,7 +48,10 @@ def test_layers_of_a_rig_are_where_the_calibration_says(rig: TurntableCalibratio
 
 def test_world_calibration_of_the_camera_carries_the_rig(rig: TurntableCalibration) -> None:
     pose = Pose.exp([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
-    calibrations = [("w", WorldCalibration(pose, "camera")), ("b", rig)]
+    calibrations: list[tuple[str, TurntableCalibration | WorldCalibration]] = [
+        ("w", WorldCalibration(pose, "camera")),
+        ("b", rig),
+    ]
     drawn = {layer.name: layer for layer in layers([], calibrations)}
     assert not looks_along_camera(calibrations)
     np.testing.assert_allclose(drawn["rigs/b/camera/x"].points[0, 0], pose.translation)

@@ -104,7 +104,7 @@ def test_blunders_do_what_they_say() -> None:
     )
     pairs = list(zip(dirty.places, clean.places, strict=True))
     off = np.concatenate([d.scan_lines[0].range_m - c.scan_lines[0].range_m for d, c in pairs])
-    dark = np.concatenate([d.scan_lines[0].intensity < 300.0 for d in dirty.places])
+    dark = np.concatenate([np.asarray(d.scan_lines[0].intensity) < 300.0 for d in dirty.places])
     assert np.median(off[dark]) == pytest.approx(0.504)
     assert np.median(off[~dark]) == pytest.approx(0.5)
     share = np.mean(np.abs(off - np.where(dark, 0.504, 0.5)) > 1e-9)

@@ -95,7 +95,7 @@ def test_the_stripe_lies_on_the_sheets_line_with_the_sheets_width(clean: Simulat
             if not np.isfinite(v):
                 continue
             slope = np.polyfit(pixels[near, 0], pixels[near, 1], 1)
-            v = np.polyval(slope, u)
+            v = float(np.polyval(slope, u))
             rows = np.arange(round(v) - 14, round(v) + 15)
             profile = np.maximum(light[rows, int(u)] - dim[rows, int(u)], 0.0)
             centre = (profile @ rows) / profile.sum()

@@ -33,11 +33,15 @@ def marker_corners() -> tuple[Camera, FloatArray, list[dict[int, FloatArray]]]:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), parameters)
-    steps, images = [], []
+    steps: list[float] = []
+    images: list[dict[int, FloatArray]] = []
     for path in sorted((DATA / "table").glob("*.jpg")):
-        corners, ids, _ = detector.detectMarkers(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None, path
+        corners, ids, _ = detector.detectMarkers(image)
         steps.append(float(path.stem[-3:]))
-        found = {} if ids is None else dict(zip(ids.ravel().tolist(), corners, strict=True))
+        keys = [] if ids is None else [int(key) for key in ids.ravel()]
+        found = dict(zip(keys, corners, strict=True)) if keys else {}
         images.append({key: np.asarray(value, dtype=float).reshape(4, 2) for key, value in found.items()})
     return Camera(640, 480, K, "plumb_bob", distortion[:5]), np.array(steps), images
 
@@ -61,7 +65,7 @@ def square_at(points: FloatArray) -> FloatArray:
 def estimated_layout(camera: Camera, images: list[dict[int, FloatArray]]) -> dict[int, FloatArray]:
     """Where the four markers' corners lie on the flat table, in the first marker's frame."""
     first = min(min(seen) for seen in images if seen)
-    layout = {first: SQUARE}
+    layout: dict[int, FloatArray] = {first: SQUARE}
     for _ in range(30):
         on_table: dict[int, list[FloatArray]] = {}
         for seen in images:
@@ -72,7 +76,7 @@ def estimated_layout(camera: Camera, images: list[dict[int, FloatArray]]) -> dic
                 directions = back.rotate(camera.rays(pixels))
                 scale = -back.translation[2] / directions[:, 2]
                 on_table.setdefault(key, []).append((back.translation + scale[:, None] * directions)[:, :2])
-        layout = {key: square_at(np.median(np.stack(values), axis=0)) for key, values in on_table.items()}
+        layout = {key: square_at(np.asarray(np.median(np.stack(values), axis=0))) for key, values in on_table.items()}
     return layout
 
 

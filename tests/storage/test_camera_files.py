@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from lidarpose.storage.camera_info import write_camera_info
 K = np.array([[1000.5, 0.0, 320.25], [0.0, 999.75, 240.5], [0.0, 0.0, 1.0]])
 
 
-def write_opencv(path: Path, distortion: np.ndarray, **more: object) -> Path:
+def write_opencv(path: Path, distortion: np.ndarray, **more: Any) -> Path:
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("image_width", 640)
     storage.write("image_height", 480)
@@ -63,8 +64,13 @@ def test_opencv_s_fisheye(tmp_path: Path) -> None:
         ("image_width", 0, "image_width"),
     ],
 )
-def test_an_opencv_file_with_a_wrong_key(tmp_path: Path, suffix: str, key: str, value: object, named: str) -> None:
-    entries = {"image_width": 640, "image_height": 480, "camera_matrix": K, "distortion_coefficients": np.zeros((1, 5))}
+def test_an_opencv_file_with_a_wrong_key(tmp_path: Path, suffix: str, key: str, value: Any, named: str) -> None:
+    entries: dict[str, Any] = {
+        "image_width": 640,
+        "image_height": 480,
+        "camera_matrix": K,
+        "distortion_coefficients": np.zeros((1, 5)),
+    }
     for left_out in (False, True):
         storage = cv2.FileStorage(str(tmp_path / f"c.{suffix}"), cv2.FILE_STORAGE_WRITE)
         for name, entry in entries.items():

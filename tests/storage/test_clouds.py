@@ -33,7 +33,7 @@ BINARY = (".ply", ".pcd", ".las", ".laz", ".e57", ".npy")
 
 def make_cloud(n: int = 500, dtype: type = np.float32, seed: int = 0) -> Cloud:
     rng = np.random.default_rng(seed)
-    fields = {
+    fields: dict[str, np.ndarray] = {
         "intensity": rng.random(n).astype(np.float32),
         "ring": rng.integers(0, 64, n).astype(np.uint16),
         "time": 1.7e9 + rng.random(n),

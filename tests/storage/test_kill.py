@@ -19,6 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -146,10 +147,10 @@ def check_recording(out: Path) -> None:
 class Made:
     """An image, scan or cloud in memory."""
 
-    content: object
+    content: Any
     name: str = "made"
 
-    def load(self) -> object:
+    def load(self) -> Any:
         return self.content
 
 

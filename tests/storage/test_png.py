@@ -28,7 +28,7 @@ FILTERS = [
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """As in a process without threads; those that run tests in parallel have some."""
     pytest.importorskip("kornia_rs", reason="the fast decoder is not installed")
-    monkeypatch.setattr(png.threading, "active_count", lambda: 1)
+    monkeypatch.setattr("lidarpose.storage.png.threading.active_count", lambda: 1)
 
 
 def chunk(kind: bytes, content: bytes) -> bytes:
@@ -102,9 +102,9 @@ def test_images_read_from_files_take_the_fast_way(monkeypatch: pytest.MonkeyPatc
 
 
 def test_beside_threads_and_without_it_opencv_decodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(png.threading, "active_count", lambda: 2)
+    monkeypatch.setattr("lidarpose.storage.png.threading.active_count", lambda: 2)
     assert fast(made_png()) is None
-    monkeypatch.setattr(png.threading, "active_count", lambda: 1)
+    monkeypatch.setattr("lidarpose.storage.png.threading.active_count", lambda: 1)
     monkeypatch.setattr(png, "_is_installed", lambda: False)
     assert fast(made_png()) is None
     np.testing.assert_array_equal(decode_image(Path("a.png"), made_png()), GREY)

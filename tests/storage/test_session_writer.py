@@ -36,17 +36,19 @@ def assert_same(read: TurntableSession, written: TurntableSession) -> None:
         assert len(read.board_images[name]) == len(shots)
         for a, b in zip(read.board_images[name], shots, strict=True):
             np.testing.assert_array_equal(a.load(), b.load())
-    for a, b in zip(read.places, written.places, strict=True):
-        assert (a.position, a.placement) == (b.position, b.placement)
-        assert a.turntable_angle_rad == pytest.approx(b.turntable_angle_rad, abs=1e-12)
-        assert (a.stripe_image is None) == (b.stripe_image is None)
-        if a.stripe_image is not None and b.stripe_image is not None:
-            np.testing.assert_array_equal(a.stripe_image.load(), b.stripe_image.load())
-        scan, other = a.scan.load(), b.scan.load()
+    for one, two in zip(read.places, written.places, strict=True):
+        assert (one.position, one.placement) == (two.position, two.placement)
+        assert one.turntable_angle_rad == pytest.approx(two.turntable_angle_rad, abs=1e-12)
+        assert (one.stripe_image is None) == (two.stripe_image is None)
+        if one.stripe_image is not None and two.stripe_image is not None:
+            np.testing.assert_array_equal(one.stripe_image.load(), two.stripe_image.load())
+        scan, other = one.scan.load(), two.scan.load()
         np.testing.assert_allclose(scan.angle_rad, other.angle_rad, atol=1e-12)
         np.testing.assert_allclose(scan.range_m, other.range_m, rtol=1e-11)
-        np.testing.assert_allclose(scan.intensity, other.intensity, rtol=1e-8)  # type: ignore[arg-type]
-        np.testing.assert_array_equal(scan.sweep, other.sweep)  # type: ignore[arg-type]
+        for found, expected in ((scan.intensity, other.intensity), (scan.sweep, other.sweep)):
+            assert (found is None) == (expected is None)
+            if found is not None and expected is not None:
+                np.testing.assert_allclose(found, expected, rtol=1e-8)
 
 
 def test_a_session_is_read_back_as_it_was(tmp_path: Path) -> None:

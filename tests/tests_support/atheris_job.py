@@ -21,6 +21,7 @@ import tempfile
 import time
 import traceback
 from pathlib import Path
+from typing import Any
 
 _SECONDS = 2.0
 _OPTIONS = ("-timeout=60", "-rss_limit_mb=1024", "-verbosity=1", "-print_final_stats=1")
@@ -85,7 +86,8 @@ def _fuzz_all(seconds: float, seed: int, page: Path | None, left: Path) -> int:
         from tests_support.bad_bytes import READERS, write_figures
 
     each = max(1, round(2.0 * seconds / len(READERS)))
-    waiting, running = [reader.name for reader in READERS], {}
+    waiting = [reader.name for reader in READERS]
+    running: dict[Any, Any] = {}
     total = bad = 0
     while waiting or running:
         while waiting and len(running) < 2:

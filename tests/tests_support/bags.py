@@ -127,15 +127,18 @@ class Messages:
 
     def cloud(self, stamp: float | None, rows: np.ndarray, **more: Any) -> Any:
         codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+        row = rows.dtype
+        assert row.fields is not None
+        assert row.names is not None
         fields = [
             self.make(
                 "sensor_msgs/msg/PointField",
                 name=name,
-                offset=int(rows.dtype.fields[name][1]),
-                datatype=codes[rows.dtype[name].str[1:]],
+                offset=int(row.fields[name][1]),
+                datatype=codes[row[name].str[1:]],
                 count=1,
             )
-            for name in rows.dtype.names
+            for name in row.names
         ]
         values = {
             "height": 1,
@@ -174,7 +177,8 @@ def write_bag(folder: Path, kind: str, entries: Iterable[tuple[str, float, Any]]
     with writer2:
         if kind == "mcap-lz4":
             # rosbags reads such chunks and does not write them; its writer takes any compressor.
-            writer2.storage.compression, writer2.storage.compressor = "lz4", lz4_compress
+            storage: Any = writer2.storage
+            storage.compression, storage.compressor = "lz4", lz4_compress
         _fill(writer2, _STORES[False], ordered, lambda message, name: _STORES[False].serialize_cdr(message, name))
     return path
 

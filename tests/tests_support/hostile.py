@@ -39,6 +39,16 @@ Case = Callable[[Path], Callable[[], object]]
 CASES: dict[str, Case] = {}
 
 
+def _of(make: Callable[..., Callable[[], object]], *arguments: object) -> Case:
+    """A case made by a function of the folder and these arguments."""
+    return lambda folder: make(folder, *arguments)
+
+
+def _of_text(name: str, text: Callable[[], str | bytes]) -> Case:
+    """A turntable session with a file of its own, whose text is made when it is wanted."""
+    return lambda folder: _turntable_with(folder, name, text())
+
+
 def case(function: Case) -> Case:
     CASES[function.__name__] = function
     return function
@@ -78,7 +88,7 @@ for _name, _text in {
         "angle_deg,range_m\n" + "".join(f"{k * 1e-4:.4f},1.5\n" for k in range(400_000)) + "x,y\n"
     ),
 }.items():
-    CASES[_name] = lambda folder, text=_text: _turntable_with(folder, "scans/0.csv", text())
+    CASES[_name] = _of_text("scans/0.csv", _text)
 
 for _name, _text in {
     "positions_of_one_long_line": lambda: "position," * 400_000,
@@ -87,7 +97,7 @@ for _name, _text in {
     ),
     "positions_of_quotes": lambda: 'position,"' + '""' * 5_000_000,
 }.items():
-    CASES[_name] = lambda folder, text=_text: _turntable_with(folder, "positions.csv", text())
+    CASES[_name] = _of_text("positions.csv", _text)
 
 for _name, _text in {
     "toml_of_brackets": lambda: "x = " + "[" * 60_000,
@@ -98,7 +108,7 @@ for _name, _text in {
     "toml_of_sixteen_megabytes": lambda: 'x = "' + "a" * (1 << 20) + '"',
     "toml_of_headers": lambda: "".join(f"[a{k}.b.c]\n" for k in range(4_000)),
 }.items():
-    CASES[_name] = lambda folder, text=_text: _turntable_with(folder, "session.toml", text())
+    CASES[_name] = _of_text("session.toml", _text)
 
 for _name, _text in {
     "yaml_billion_laughs": lambda: (
@@ -115,7 +125,7 @@ for _name, _text in {
     "yaml_with_an_object": lambda: "image_width: !!python/object/apply:os.system ['true']\n",
     "yaml_of_merges": lambda: "a: &a {x: 1}\n" + "".join(f"b{k}:\n  <<: *a\n" for k in range(3_000)),
 }.items():
-    CASES[_name] = lambda folder, text=_text: _turntable_with(folder, "camera.yaml", text())
+    CASES[_name] = _of_text("camera.yaml", _text)
 
 
 def _camera(folder: Path, name: str, text: str) -> Callable[[], object]:
@@ -165,7 +175,7 @@ for _name, _text in {
         '"translation_m": [1e308, -1e308, 1e308], "quaternion_xyzw": [1e308, 1e308, 1e308, 1e308]}]}'
     ),
 }.items():
-    CASES[_name] = lambda folder, text=_text: _json(folder, text())
+    CASES[_name] = _of(lambda folder, text: _json(folder, text()), _text)
 
 
 def _png_header(width: int, height: int) -> bytes:
@@ -207,7 +217,7 @@ for _name, _data in {
     "hdr_of_60000": lambda: b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 60000 +X 60000\n" + bytes(1000),
     "sun_raster_of_60000": lambda: struct.pack(">8I", 0x59A66A95, 60_000, 60_000, 8, 0, 1, 0, 0) + bytes(1000),
 }.items():
-    CASES[_name] = lambda folder, data=_data: _stripe(folder, data())
+    CASES[_name] = _of(lambda folder, data: _stripe(folder, data()), _data)
 
 for _name, _file, _before, _after in (
     ("name_that_leads_out", "session.toml", '"camera.yaml"', '"../camera.yaml"'),
@@ -232,7 +242,7 @@ for _name, _file, _before, _after in (
     ("placement_of_stars", "positions.csv", ",here", ",**"),
     ("angle_of_a_thousand_digits", "positions.csv", "0,0,", "0," + "9" * 100_000 + ","),
 ):
-    CASES[_name] = lambda folder, f=_file, b=_before, a=_after: _edited(folder, f, b, a)
+    CASES[_name] = _of(_edited, _file, _before, _after)
 
 for _name, _before, _after in (
     ("clouds_that_lead_out", "clouds/p0/*.pcd", "../../*/*.pcd"),
@@ -244,7 +254,7 @@ for _name, _before, _after in (
     ("clouds_with_a_long_name", "clouds/p0/*.pcd", "c" * 60_000),
     ("world_of_1e300", "0,1.5,0", "1e300,1.5,0"),
 ):
-    CASES[_name] = lambda folder, b=_before, a=_after: _corners_edited(folder, b, a)
+    CASES[_name] = _of(_corners_edited, _before, _after)
 
 
 @case
@@ -263,10 +273,10 @@ def _replaced(folder: Path, name: str, make: Callable[[Path], object]) -> Callab
 
 for _name in ("session.toml", "camera.yaml", "positions.csv", "scans/0.csv", "stripes/0.png"):
     _word = Path(_name).name.replace(".", "_")
-    CASES[f"loop_for_{_word}"] = lambda folder, n=_name: _replaced(folder, n, lambda path: path.symlink_to(path))
-    CASES[f"folder_for_{_word}"] = lambda folder, n=_name: _replaced(folder, n, Path.mkdir)
-    CASES[f"pipe_for_{_word}"] = lambda folder, n=_name: _replaced(folder, n, os.mkfifo)
-    CASES[f"device_for_{_word}"] = lambda folder, n=_name: _replaced(folder, n, lambda p: p.symlink_to("/dev/zero"))
+    CASES[f"loop_for_{_word}"] = _of(_replaced, _name, lambda path: path.symlink_to(path))
+    CASES[f"folder_for_{_word}"] = _of(_replaced, _name, Path.mkdir)
+    CASES[f"pipe_for_{_word}"] = _of(_replaced, _name, os.mkfifo)
+    CASES[f"device_for_{_word}"] = _of(_replaced, _name, lambda path: path.symlink_to("/dev/zero"))
 
 
 @case
@@ -309,7 +319,7 @@ for _name, _shape, _descr in (
     ("recording_of_nothing", "(0, 0)", "<f4"),
     ("recording_of_many_axes", "(" + "1, " * 3000 + ")", "<f4"),
 ):
-    CASES[_name] = lambda folder, s=_shape, d=_descr: _recording(folder, s, d)
+    CASES[_name] = _of(_recording, _shape, _descr)
 
 
 @case

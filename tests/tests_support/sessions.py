@@ -42,7 +42,7 @@ def blank_images(paths: list[Path]) -> None:
     for path in paths:
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         assert image is not None
-        dark = np.random.default_rng(0).integers(0, 6, image.shape).astype(np.uint8)
+        dark = np.asarray(np.random.default_rng(0).integers(0, 6, image.shape), dtype=np.uint8)
         assert cv2.imwrite(str(path), dark)
 
 

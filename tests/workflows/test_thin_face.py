@@ -25,6 +25,7 @@ def test_a_face_of_single_lines_is_found_by_all_places_together(seed: int, by_ed
     result = calibrate_world(session, located=located)
     xi = result.T_world_source.minus(truth.T_world_lidar)
     assert np.linalg.norm(xi[:3]) < 0.005
+    assert result.covariance is not None
     assert xi @ np.linalg.solve(result.covariance, xi) < 22.5  # 99.9 % of chi-square with six degrees
     if by_edges:
         with pytest.raises(UndeterminedError, match="two faces"):

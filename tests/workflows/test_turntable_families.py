@@ -44,6 +44,7 @@ def test_the_papers_set_up_keeps_the_papers_figures() -> None:
     millimetres, degrees = errors_inside_the_arc(rig, run.paper_motion)
     assert millimetres < 1.0
     assert degrees < 0.1
+    assert run.deviation is not None
     assert run.deviation.centre_mm.mean <= 1.12
     assert run.deviation.z_deg.mean <= 0.203
     assert run.deviation.x_deg.mean <= 0.662

@@ -48,6 +48,7 @@ def test_each_method_finds_the_pose(simulated: Simulated, method: str, degrees: 
     if method == "joint":
         assert result.quality.verdict == "good"
         xi = result.T_world_source.minus(truth.T_world_lidar)
+        assert result.covariance is not None
         assert xi @ np.linalg.solve(result.covariance, xi) < 22.5  # 99.9 % of chi-square with six degrees
 
 
