@@ -79,8 +79,10 @@ def information_correction(standardised: FloatArray, weight: FloatArray) -> floa
     return float(np.clip(bend**2 / (square * mean_weight), 0.3, 1.0))
 
 
-_SURE_LAG = 2.0
-"""A correlation below so many of its standard deviations ends the sum over lags."""
+_NO_LAG, _SURE_LAG = 1.0, 2.0
+"""A correlation below the first so many of its standard deviations ends the sum over lags.
+
+Up to the second it counts by its share, or steps would go to and fro for ever."""
 _MOST_LAGS = 60
 
 
@@ -88,7 +90,7 @@ def rows_that_count_as_one(psi: FloatArray, line_of_row: IntArray, parameters: f
     """How many neighbouring measurements of a line are worth one, at least 1.
 
     The variance of a mean of correlated rows exceeds that of independent ones by 1 + 2 (rho_1 + rho_2 + ...) (Bartlett,
-    1946). The sum ends at the first lag whose correlation is not significant. A line of hundreds of rows has enough of
+    1946). The sum fades out where correlations are not significant. A line of hundreds of rows has enough of
     them to tell this even where lines are few.
 
     Parameters
@@ -105,16 +107,17 @@ def rows_that_count_as_one(psi: FloatArray, line_of_row: IntArray, parameters: f
         return 1.0
     square = float(psi @ psi) / n
     taken = parameters / (n - parameters)
-    total = 0.0
+    total, share = 0.0, 1.0
     for lag in range(1, min(_MOST_LAGS, len(psi) - 1) + 1):
         pairs = used[lag:] & used[:-lag] & (line_of_row[lag:] == line_of_row[:-lag])
         count = int(np.count_nonzero(pairs))
         if count < 20:
             break
         correlation = float(psi[lag:][pairs] @ psi[:-lag][pairs]) / count / square + taken
-        if correlation < _SURE_LAG / np.sqrt(count):
+        share *= float(np.clip((correlation * np.sqrt(count) - _NO_LAG) / (_SURE_LAG - _NO_LAG), 0.0, 1.0))
+        if share == 0.0:
             break
-        total += correlation
+        total += share * correlation
     return 1.0 + 2.0 * total
 
 

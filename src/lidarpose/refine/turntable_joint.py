@@ -544,7 +544,9 @@ def _update_lines(
     if with_places:
         by_line, good = own_effects(moments)
         psi = np.where(use & good[lines.line_of_row], row_weights * _less(lines, residuals, by_line) / lines.sigma, 0.0)
-        as_one = rows_that_count_as_one(psi, lines.line_of_row, 2.0 * lines.count)
+        found = rows_that_count_as_one(psi, lines.line_of_row, 2.0 * lines.count)
+        # Half-way once it is known: weights and correlations follow each other.
+        as_one = found if as_one == 1.0 else 0.5 * (as_one + found)
     return LineNoise(
         factor, variance, row_weights, line_weights, correction, noise.neighbour_factor, as_one, places.certainty_factor
     )
