@@ -92,7 +92,7 @@ print(twice(3.0), twice.stats.cache_path)
 
 def test_where_kernels_go_is_asked_of_the_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     writable: set[Path] = set()
-    monkeypatch.setattr(compiled.os, "access", lambda folder, mode: Path(folder) in writable)
+    monkeypatch.setattr("lidarpose.geometry.compiled.os.access", lambda folder, mode: Path(folder) in writable)
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert not compiled._can_store()
