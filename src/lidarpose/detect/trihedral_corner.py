@@ -24,8 +24,8 @@ MIN_FACE_POINTS = 12
 # Share of a face's points that have to lie on the right side of the other two.
 ONE_SIDED = 0.9
 OUTLINE_DIRECTIONS = 64
-# A point this far outside of a face's outline, which ends at its last scan line, is still of the face.
-SLACK_M = 0.02
+# An outline ends at a face's last scan line, and the face within this of it, if nothing else lies there.
+RIM_M = 0.02
 # By how much kernels are done sooner, on one core.
 SAVED_S_PER_BEAM = 1e-7
 
@@ -262,7 +262,7 @@ class FaceMask:
     def _select_compiled(self, rays: FloatArray, range_m: FloatArray, gate_m: float) -> tuple[IntArray, IntArray]:
         from lidarpose.detect.target_kernels import faces_met
 
-        edges = [_edges(o, n, SLACK_M) for o, n in zip(self.outlines, self.normals, strict=True)]
+        edges = [_edges(o, n, RIM_M) for o, n in zip(self.outlines, self.normals, strict=True)]
         planes = np.array([[*plane.normal, plane.offset] for plane in self.obstacles]).reshape(-1, 4)
         found = faces_met(
             rays,
@@ -280,6 +280,11 @@ class FaceMask:
         )
         indices = [np.flatnonzero(found == j) for j in range(3)]
         return np.concatenate(indices), np.repeat(np.arange(3), [len(index) for index in indices])
+
+    def on_rim(self, face: int, rays: FloatArray) -> BoolArray:
+        """Which rays (3, N) to a face pass outside its outline, within its rim."""
+        normal = self.normals[face]
+        return ~in_outline(rays * ((normal @ self.corner) / (normal @ rays)), self.outlines[face], normal, 0.0)
 
     def _off_edge_m(self, face: int, other: int) -> float:
         """How far a face's points have to be from another's plane to be off their common edge."""
@@ -320,7 +325,7 @@ class FaceMask:
         `height` (3, N) are their projections onto the three normals.
         """
         normal = self.normals[face]
-        good = in_outline(on_face, self.outlines[face], normal, SLACK_M)
+        good = in_outline(on_face, self.outlines[face], normal, RIM_M)
         for k in range(3):
             if k != face:
                 good &= np.abs(height[k] - self.normals[k] @ self.corner) > self._off_edge_m(face, k)

@@ -141,18 +141,23 @@ def face_residuals(returns: FaceReturns, normal: FloatArray, corner: FloatArray)
     return np.asarray(returns.range_m - (normal @ corner) / (normal @ returns.rays))
 
 
-def direction_cells(rays: FloatArray, cell_rad: float) -> IntArray:
-    """Which cell (N,) of a grid of angles about the bundle's middle each ray (3, N) falls in, counted from 0."""
+def direction_grid(rays: FloatArray, cell_rad: float) -> IntArray:
+    """Row and column (2, N), from 0, of rays (3, N) in a grid of angles about the bundle's middle."""
     local = np.linalg.svd(rays.mean(axis=1)[None])[2] @ rays
     angles = np.arctan(local[1:] / np.maximum(np.abs(local[0]), 1e-12))
     grid = np.floor(angles / cell_rad).astype(np.int64)
-    grid -= grid.min(axis=1, keepdims=True)
+    return np.asarray(grid - grid.min(axis=1, keepdims=True))
+
+
+def direction_cells(rays: FloatArray, cell_rad: float) -> IntArray:
+    """Which cell (N,) of `direction_grid` each ray (3, N) falls in, those that hold any counted from 0."""
+    grid = direction_grid(rays, cell_rad)
     flat = grid[0] * (int(grid[1].max()) + 1) + grid[1]
     number = np.cumsum(np.bincount(flat) > 0) - 1
     return np.asarray(number[flat], dtype=np.int64)
 
 
-def _rows(rays: FloatArray, normal: FloatArray, corner: FloatArray) -> tuple[FloatArray, FloatArray]:
+def face_rows(rays: FloatArray, normal: FloatArray, corner: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Expected ranges (N,), and their derivatives (3, N) by the plane's shift and two tilts about the corner."""
     axes = np.vstack([normal, tangents(normal).T])
     rows = axes @ rays
@@ -193,7 +198,7 @@ def weighted_rows(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Measured minus expected ranges (N,), the derivatives (3, N) of the expected ones by the plane's shift and its two
     tilts about the corner, and the weights (N,), one over the noise squared times the loss's own."""
-    expected, rows = _rows(returns.rays, normal, corner)
+    expected, rows = face_rows(returns.rays, normal, corner)
     residual = returns.range_m - expected
     weight = _weights(residual, sigma_m)
     weight *= 1.0 / sigma_m**2
@@ -466,7 +471,7 @@ def frame_corners(
     moves = np.full((frames, 3, 3), np.nan)
     for j in range(3):
         f = faces[j]
-        expected, rows = _rows(f.rays, normals[j], corner)
+        expected, rows = face_rows(f.rays, normals[j], corner)
         residual = f.range_m - expected
         weight = _weights(residual, sigma_m)
         weighted = weight * rows

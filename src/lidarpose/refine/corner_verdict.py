@@ -25,6 +25,8 @@ OWN_TURN_STATISTIC, OWN_TURN_DEG = 60.0, 0.3
 WORLD_SIGMA_DOUBTFUL_MM = 10.0
 NOISE_RATIO_DOUBTFUL = 3.0
 CELL_RAD = np.radians(1.5)
+# Where distances disagree by less, nobody asks why.
+LEAST_MISFIT_M = 0.002
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,8 +221,11 @@ def _judge_scale(verdict: _Verdict, pose: Pose, world: FloatArray, lidar: FloatA
     cw, cp = world - world.mean(axis=0), lidar - lidar.mean(axis=0)
     turned = cp @ nearest_rotation(cw.T @ cp).T
     scale = float((cw * turned).sum() / (turned * turned).sum())
-    misfit = _rms(cw - turned)
-    if misfit > 0.005 and len(world) > 3 and _rms(cw - scale * turned) < 0.3 * misfit:
+    if len(world) < 4:
+        return
+    misfit, rest = _rms(cw - turned), _rms(cw - scale * turned)
+    # The F statistic of one more parameter; 100 is beyond chance from four places on.
+    if misfit > LEAST_MISFIT_M and misfit**2 - rest**2 > 100.0 * rest**2 / (3 * len(world) - 7):
         verdict.doubt(
             f"distances between the world coordinates are {scale:.4f} times those between the corners: check the "
             "unit, or ask for the scale as well"

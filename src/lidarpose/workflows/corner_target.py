@@ -19,7 +19,8 @@ from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import NEAR_RADIUS_M, CornerPlace, CornerSession
 from lidarpose.model.observation import LeftOut
-from lidarpose.refine.corner_model import FreeCorner, direction_cells, face_residuals, fit_corner
+from lidarpose.refine.corner_model import FreeCorner, fit_corner
+from lidarpose.refine.face_screening import without_foreign_spots
 from lidarpose.solve.corner_matching import (
     SAME_ORIENTATION_RAD,
     TOLERANCE_M,
@@ -38,9 +39,6 @@ FACE_RETURNS, FEWEST_FACE_RETURNS = 30, 15
 LOOKS = 4
 GATE_SIGMAS = 6.5
 FIRST_GATE_M = 0.05
-SPOT_RAD = np.radians(1.2)
-# Beams of a multi-beam LiDAR are off by about one sigma each, all frames alike: that is no reason to drop them.
-ODD_SPOT_SIGMAS = 1.75
 # The share of a face next to the corner on which the first fit stands, before its far edges are trusted.
 INNER_SHARE = 0.6
 INNER_STEPS, FIT_STEPS = 2, 5
@@ -399,23 +397,12 @@ def select_faces(
             continue
         returns = FaceReturns(crop.rays.take(mine, axis=1).T, crop.range_m[mine], crop.frame[mine])
         if sigma_m is not None:
-            returns = _second_screening(returns, mask.normals[j], mask.corner, sigma_m)
+            returns = without_foreign_spots(
+                returns, mask.on_rim(j, returns.rays), mask.normals[j], mask.corner, sigma_m
+            )
         if len(returns) >= MIN_FACE_RETURNS:
             faces[j] = returns
     return faces
-
-
-def _second_screening(returns: FaceReturns, normal: FloatArray, corner: FloatArray, sigma_m: float) -> FaceReturns:
-    """Drop spots of the face whose returns are all off the plane: ground at the target's foot, a strap, a hand.
-
-    The paper screens by neighbours' normals; a spot's mean residual over all frames says the same, and sooner.
-    """
-    residual = face_residuals(returns, normal, corner)
-    cell = direction_cells(returns.rays, SPOT_RAD)
-    count = np.bincount(cell)
-    mean = np.bincount(cell, residual) / count
-    odd = (np.abs(mean) > ODD_SPOT_SIGMAS * sigma_m) & (np.abs(mean) * np.sqrt(count) > 4.5 * sigma_m)
-    return returns.subset(np.flatnonzero(~odd[cell])) if odd.any() else returns
 
 
 def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> FreeCorner | None:
