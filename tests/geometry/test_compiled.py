@@ -1,5 +1,6 @@
 """When kernels pay, and that they work where nothing can be stored."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ def fresh(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """As if this process had asked nothing yet and numba were not imported."""
     monkeypatch.setattr(compiled, "_ledger", compiled._Ledger())
     monkeypatch.delitem(sys.modules, "numba", raising=False)
-    monkeypatch.setattr(compiled, "_can_store", lambda: True)
+    monkeypatch.setattr(compiled, "_any_stored", lambda: True)
     return monkeypatch
 
 
@@ -54,9 +55,9 @@ def test_numba_that_cannot_be_imported_is_asked_once_and_never_used(fresh: pytes
     assert len(asked) == 1
 
 
-def test_where_nothing_can_be_stored_kernels_have_to_be_worth_compiling(fresh: pytest.MonkeyPatch) -> None:
+def test_where_nothing_is_stored_kernels_have_to_be_worth_compiling(fresh: pytest.MonkeyPatch) -> None:
     pretend(fresh, True)
-    fresh.setattr(compiled, "_can_store", lambda: False)
+    fresh.setattr(compiled, "_any_stored", lambda: False)
     assert not compiled.pays(0.9 * compiled.COMPILING_S)
     assert compiled.pays(0.2 * compiled.COMPILING_S)
 
@@ -90,19 +91,27 @@ print(twice(3.0), twice.stats.cache_path)
     assert done.stderr == ""
 
 
-def test_where_kernels_go_is_asked_of_the_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    writable: set[Path] = set()
-    monkeypatch.setattr("lidarpose.geometry.compiled.os.access", lambda folder, mode: Path(folder) in writable)
+@pytest.mark.skipif(not compiled.installed(), reason="numba is not installed")
+def test_stored_kernels_are_found_where_numba_puts_them(tmp_path: Path) -> None:
+    code = """
+from lidarpose.geometry import compiled
+print(compiled._any_stored())
+from lidarpose.measure import kernels
+import numpy as np
+one = np.ones(1)
+kernels._per_sweep(np.ones((1, 1)), np.ones((1, 3, 2)), np.ones((1, 3)), one, one, np.ones((1, 3)))
+print(compiled._any_stored())
+"""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.split() == ["False", "True"]
+
+
+def test_a_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    assert not compiled._can_store()
-    writable.add(tmp_path)
-    assert compiled._can_store()
-    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError))
-    assert not compiled._can_store()
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    assert compiled._can_store()
+    assert [depth for _, depth in compiled._stores()] == ["*/__pycache__"]
 
 
 def test_asking_for_little_imports_nothing() -> None:

@@ -7,7 +7,8 @@ and one by kernels asks `pays` each time, and says how much sooner the kernels w
 - always where it has been imported already,
 - else as soon as what they would have saved so far, the work at hand included, is worth the import: the rule of those
   who rent skis until they have paid the price of a pair. One run costs at most twice what it would have cost by the
-  better of both ways, and a process that goes on comes to the kernels by itself.
+  better of both ways, and a process that goes on comes to the kernels by itself. Where none have been compiled and
+  stored yet, compiling them is part of the price.
 
 Both ways give the same answer, to the bit or to its rounding, so that it does not matter which one ran.
 
@@ -26,10 +27,9 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar, cast
 
-# Seconds of a process: importing numba and loading some kernels; the same where nothing can be stored, so that each
-# process compiles anew.
+# Seconds of a process: importing numba and loading some kernels; the same where they have to be compiled first.
 LOADING_S = 0.6
-COMPILING_S = 5.0
+COMPILING_S = 8.0
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -58,7 +58,7 @@ def pays(saves_s: float) -> bool:
             return _ledger.forced
         if _ledger.usable is None and "numba" not in sys.modules:
             _ledger.lost_s += saves_s
-            if _ledger.lost_s < (LOADING_S if _can_store() else COMPILING_S):
+            if _ledger.lost_s < (LOADING_S if _any_stored() else COMPILING_S):
                 return False
         if _ledger.usable is None:
             _ledger.usable = _importable()
@@ -107,16 +107,19 @@ def _importable() -> bool:
     return True
 
 
-def _can_store() -> bool:
-    """Whether numba will find a folder for compiled kernels: beside this package's byte code, or the user's cache."""
-    if os.environ.get("NUMBA_CACHE_DIR"):
-        return True
-    beside = Path(__file__).parent
+def _any_stored() -> bool:
+    """Whether an earlier process has stored kernels for this Python: beside this package's byte code, or in a cache."""
+    tag = f"*kernels.*.py{sys.version_info.major}{sys.version_info.minor}*.nbi"
+    return any(next(folder.glob(f"{depth}/{tag}"), None) is not None for folder, depth in _stores())
+
+
+def _stores() -> list[tuple[Path, str]]:
+    """Folders in which numba stores, and where below them."""
+    found = [(Path(__file__).parents[1], "*/__pycache__")]
+    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
+        return [(Path(chosen), "*")]
     try:
         cache = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     except RuntimeError:  # a user without a home
-        cache = os.devnull
-    # A folder that is not there yet is made where its parent can be written to.
-    choices = ((beside / "__pycache__", beside), (Path(cache) / "numba", Path(cache), Path(cache).parent))
-    nearest = (next((folder for folder in folders if folder.is_dir()), None) for folders in choices)
-    return any(folder is not None and os.access(folder, os.W_OK) for folder in nearest)
+        return found
+    return [*found, (Path(cache) / "numba", "*")]
