@@ -105,20 +105,39 @@ def rows_that_count_as_one(psi: FloatArray, line_of_row: IntArray, parameters: f
     n = int(np.count_nonzero(used))
     if n <= 2.0 * parameters:
         return 1.0
-    square = float(psi @ psi) / n
+    square = float((psi * psi).sum()) / n
     taken = parameters / (n - parameters)
+    products, counts = (_sums_at_lags(values, line_of_row) for values in (psi, used.astype(np.float64)))
     total, share = 0.0, 1.0
-    for lag in range(1, min(_MOST_LAGS, len(psi) - 1) + 1):
-        pairs = used[lag:] & used[:-lag] & (line_of_row[lag:] == line_of_row[:-lag])
-        count = int(np.count_nonzero(pairs))
-        if count < 20:
+    for product, pairs in zip(products.tolist(), np.rint(counts).tolist(), strict=True):
+        if pairs < 20:
             break
-        correlation = float(psi[lag:][pairs] @ psi[:-lag][pairs]) / count / square + taken
-        share *= float(np.clip((correlation * np.sqrt(count) - _NO_LAG) / (_SURE_LAG - _NO_LAG), 0.0, 1.0))
+        correlation = product / pairs / square + taken
+        share *= min(max((correlation * pairs**0.5 - _NO_LAG) / (_SURE_LAG - _NO_LAG), 0.0), 1.0)
         if share == 0.0:
             break
         total += share * correlation
     return 1.0 + 2.0 * total
+
+
+def _sums_at_lags(values: FloatArray, line_of_row: IntArray) -> FloatArray:
+    """Sums (L,) of values (N,) times those 1, 2, ... rows further on in the same line; lines follow one another.
+
+    By the Fourier transform, with so many zeros between lines that none meets the next.
+    """
+    first = int(line_of_row[0])
+    size = len(values) + _MOST_LAGS * (int(line_of_row[-1]) - first + 1)
+    spread = np.zeros(_smooth_size(size))
+    spread[np.arange(len(values)) + _MOST_LAGS * (line_of_row - first)] = values
+    spectrum = np.fft.rfft(spread)
+    power = spectrum.real**2 + spectrum.imag**2
+    return np.asarray(np.fft.irfft(power, len(spread))[1 : min(_MOST_LAGS, len(values) - 1) + 1])
+
+
+def _smooth_size(least: int) -> int:
+    """The next size of a few bits and then zeros: the transform of a size with large factors is slow."""
+    step = 1 << max(least.bit_length() - 4, 0)
+    return -(-least // step) * step
 
 
 _SCATTER_BINS = 8
