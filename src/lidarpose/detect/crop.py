@@ -17,7 +17,7 @@ def inside_box(points: NDArray[np.floating], low: FloatArray, high: FloatArray) 
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     # The farther the box lies out along an axis for its size, the fewer points share that coordinate.
     order = np.argsort(-np.abs(middle) / half)
-    if points.flags.c_contiguous and pays(SAVED_S_PER_POINT * len(points)):
+    if points.flags.c_contiguous and pays(SAVED_S_PER_POINT * len(points), "detect.target_kernels"):
         from lidarpose.detect.target_kernels import points_in_box
 
         return np.asarray(points_in_box(points, order, middle.astype(points.dtype), half))

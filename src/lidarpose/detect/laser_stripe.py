@@ -25,7 +25,7 @@ import numpy as np
 from lidarpose.detect.albedo import measure_albedo
 from lidarpose.detect.chessboard import BoardDetection
 from lidarpose.detect.stripe_fit import StripeFit, fit_stripes
-from lidarpose.detect.stripe_search import PanelView, find_line, has_line
+from lidarpose.detect.stripe_search import KERNELS, PanelView, find_line, has_line
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.compiled import pays
 from lidarpose.model.image import GrayImage
@@ -81,7 +81,7 @@ class StripeFinder:
         for image in images:
             if image.shape != self._shape:
                 raise ValueError(f"the stripe image has {image.shape} pixels, the bright images have {self._shape}")
-        pays(_SAVED_S_PER_STRIPE * len(images) * len(self._views))  # what follows asks again, for nothing more
+        pays(_SAVED_S_PER_STRIPE * len(images) * len(self._views), KERNELS)  # what follows asks again, for nothing more
         stripes: list[dict[int, StripePoints]] = [{} for _ in images]
         problems: list[list[LeftOut]] = [[] for _ in images]
         for k, view in enumerate(self._views):

@@ -56,7 +56,7 @@ class _Cells:
         self.cell = strides @ scaled.astype(np.int32)
         self.taken: BoolArray = np.zeros(int(np.prod(shape)), dtype=bool)
         slack = np.float32(SLACK_M / CELL_M)
-        if pays(SAVED_S_PER_POINT * len(self.index)):
+        if pays(SAVED_S_PER_POINT * len(self.index), "detect.target_kernels"):
             from lidarpose.detect.target_kernels import mark_cells
 
             mark_cells(scaled, slack, strides, self.taken)

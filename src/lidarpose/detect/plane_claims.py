@@ -309,7 +309,7 @@ class Ahead:
     @staticmethod
     def where_it_pays(x: NDArray[np.floating]) -> Ahead | None:
         """None where NumPy is to pass over the cloud."""
-        return Ahead(x) if pays(SAVED_S_PER_POINT * len(x)) else None
+        return Ahead(x) if pays(SAVED_S_PER_POINT * len(x), "detect.plane_kernels") else None
 
     def columns(self, block: slice) -> Float32Array:
         """Points of a block as rows (3, N)."""

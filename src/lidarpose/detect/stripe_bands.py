@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarpose.detect.albedo import MARGIN, PanelAlbedo, edge_scale, erf_table
-from lidarpose.detect.stripe_search import NODE_STEP, CoarseLine, PanelView
+from lidarpose.detect.stripe_search import KERNELS, NODE_STEP, CoarseLine, PanelView
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.robust import MAD_TO_SIGMA
@@ -138,7 +138,7 @@ def cut(source: Source, ranges: Ranges, curves: Curves, half: FloatArray) -> Ban
     """Profiles of 2 half + 1 pixels about the curves; `half` (B,) may differ from band to band."""
     slope = curves.slope(ranges.u)
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
-    v, values, bright, good = (_cut_compiled if pays(0.0) else _cut)(source, ranges, curves.at(ranges.u), half)
+    v, values, bright, good = (_cut_compiled if pays(0.0, KERNELS) else _cut)(source, ranges, curves.at(ranges.u), half)
     nothing = np.zeros_like(values)
     return Bands(ranges.u, ranges.valid, v, values, bright, good, nothing, cosine, slope * cosine, nothing)
 
@@ -268,7 +268,7 @@ def _ambient(bands: Bands, beyond: FloatArray, curves: Curves) -> FloatArray:
 
 def _ambient_products(bands: Bands, centre: FloatArray, beyond: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Sums (B, N) of bright * bright and bright * values over the pixels beside the stripe, both less their means."""
-    if pays(0.0):
+    if pays(0.0, KERNELS):
         from lidarpose.detect import stripe_kernels
 
         own, cross = np.empty(centre.shape, np.float32), np.empty(centre.shape, np.float32)
@@ -290,7 +290,7 @@ def look_at_albedo(bands: Bands, source: Source, curves: Curves, width: FloatArr
     centre, slope = curves.at(bands.u), curves.slope(bands.u)
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
     sine = slope * cosine
-    squares = (_squares_compiled if pays(0.0) else _squares)(source, bands.u, centre, cosine, sine, width)
+    squares = (_squares_compiled if pays(0.0, KERNELS) else _squares)(source, bands.u, centre, cosine, sine, width)
     light = _light_shares(bands, source.view.albedo, for_table(centre), *squares[:3])
     return replace(bands, cosine=cosine, sine=sine, light=light, good=bands.good * squares[3])
 
@@ -343,7 +343,7 @@ def _light_shares(
     reach = bands.half + 1.0
     x_range, y_range = ((g - reach * np.abs(d), g + reach * np.abs(d)) for g, d in zip(grid, per_v, strict=True))
     near = albedo.near_ends(x_range, y_range, edges)
-    if pays(0.0):
+    if pays(0.0, KERNELS):
         from lidarpose.detect import stripe_kernels
 
         scales = np.stack([edge_scale(edge) for edge in edges])

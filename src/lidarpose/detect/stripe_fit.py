@@ -36,7 +36,7 @@ from lidarpose.detect.stripe_bands import (
     usable_ranges,
 )
 from lidarpose.detect.stripe_noise import NOISE_SAMPLES, learn_noise, sampled
-from lidarpose.detect.stripe_search import CoarseLine, PanelView
+from lidarpose.detect.stripe_search import KERNELS, CoarseLine, PanelView
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.robust import MAD_TO_SIGMA, tukey_weights
@@ -256,7 +256,7 @@ def _start(bands: Bands, curves: Curves, width: FloatArray, ratio: FloatArray, n
 
 def _start_sums(bands: Bands, centre: FloatArray, width: FloatArray, ratio: FloatArray) -> Sequence[FloatArray]:
     """Sums over each profile's good pixels: 1, bell, values, bell^2 and bell * values, (B, N) each."""
-    if pays(0.0):
+    if pays(0.0, KERNELS):
         from lidarpose.detect import stripe_kernels
 
         bell = _bell_compiled(bands, centre, width)
@@ -283,7 +283,7 @@ def _bell_compiled(bands: Bands, centre: FloatArray, width: FloatArray) -> Float
 
 def _step(bands: Bands, state: _State, curves: Curves, *, learn: bool) -> _State:
     """One Gauss-Newton step; with `learn`, the noise is learnt again first."""
-    M, noise = (_equations_compiled if pays(0.0) else _equations)(bands, state, learn=learn)
+    M, noise = (_equations_compiled if pays(0.0, KERNELS) else _equations)(bands, state, learn=learn)
     M[_BACKGROUND][0] += 1e-9
     M[_HEIGHT][0] += 1e-9
     M[_CENTRE][0] += 1.0 / _PULL_PX**2

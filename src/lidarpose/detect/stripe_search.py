@@ -17,6 +17,7 @@ from lidarpose.model.image import GrayImage
 
 # Panels are reduced to about this many pixels across; a stripe keeps most of its height at a quarter of the size.
 _SMALL_SIDE = 180
+KERNELS = "detect.stripe_kernels"
 # Random places, the same for all images, at which pairs of maxima are drawn.
 _DRAWS = np.random.default_rng(0).random((2, 80))
 # Votes of a column whose maximum is as high as is typical, or higher.
@@ -109,7 +110,7 @@ class PanelView:
 
     def reduced(self, image: GrayImage) -> FloatArray:
         """The panel's part of an image, reduced (float32)."""
-        if self.factor > 1 and image.dtype == np.uint8 and pays(0.0):
+        if self.factor > 1 and image.dtype == np.uint8 and pays(0.0, KERNELS):
             from lidarpose.detect import stripe_kernels
 
             return np.asarray(stripe_kernels.block_means(image, self.low, self.high, self.factor))
@@ -340,7 +341,7 @@ def _rest_and_ridges(
     """What the bright image (`template`) does not explain, zero off the panel; its ridges along x and along y."""
     if len(view.light) == 0 or len(view.dark) == 0:
         rest = np.zeros_like(small)
-    elif pays(0.0):
+    elif pays(0.0, KERNELS):
         from lidarpose.detect import stripe_kernels
 
         rest, along, across = np.empty_like(small), np.empty_like(small), np.empty(small.shape[::-1], np.float32)
@@ -381,7 +382,7 @@ _Line = tuple[float, float, float, float, float, float, float]
 
 def _line_in(ridge: FloatArray, threshold: float) -> _Line | None:
     """The line through the columns' maxima above a threshold."""
-    if pays(0.0):
+    if pays(0.0, KERNELS):
         from lidarpose.detect import stripe_kernels
 
         peak, height = np.empty(ridge.shape[1], np.int64), np.empty(ridge.shape[1], np.float32)
@@ -453,7 +454,7 @@ def _erase(ridge: FloatArray, line: _SmallLine, steep: bool) -> None:
     field = ridge if steep == line.steep else ridge.T
     x = np.arange(field.shape[1])
     middle = np.rint(line.intercept + line.slope * x).astype(np.intp)
-    if pays(0.0):
+    if pays(0.0, KERNELS):
         from lidarpose.detect import stripe_kernels
 
         stripe_kernels.erase(field, middle, reach)

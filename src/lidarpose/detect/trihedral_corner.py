@@ -243,7 +243,7 @@ class FaceMask:
         Indices (M,), and the face (M,) of each: 0, 1 or 2.
         """
         rays = np.ascontiguousarray(directions.T)
-        if pays(SAVED_S_PER_BEAM * len(range_m)):
+        if pays(SAVED_S_PER_BEAM * len(range_m), "detect.target_kernels"):
             return self._select_compiled(rays, range_m, gate_m)
         face, predicted, slope = self._meet(rays)
         with np.errstate(invalid="ignore"):

@@ -1,14 +1,14 @@
 """When kernels compiled by numba (the `fast` extra) pay, for all who have such kernels.
 
 Importing numba and loading kernels from the disk takes a process about 0.6 s, once. Whoever has a way by NumPy
-and one by kernels asks `pays` each time, and says how much sooner the kernels would be done. They are taken
+and one by kernels asks `pays` each time, and says which kernels, and how much sooner they would be done. They are taken
 
 - never where numba is not installed or cannot be imported,
-- always where it has been imported already,
+- always where it has been imported already and these kernels are stored on the disk,
 - else as soon as what they would have saved so far, the work at hand included, is worth the import: the rule of those
   who rent skis until they have paid the price of a pair. One run costs at most twice what it would have cost by the
-  better of both ways, and a process that goes on comes to the kernels by itself. Where none have been compiled and
-  stored yet, compiling them is part of the price.
+  better of both ways, and a process that goes on comes to the kernels by itself. The import is paid by all kernels
+  that are stored. Those that are not have to be worth their own compiling.
 
 Both ways give the same answer, to the bit or to its rounding, so that it does not matter which one ran.
 
@@ -35,33 +35,53 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class _Ledger:
-    """What the NumPy way has cost this process beyond the kernels', and what has been decided."""
+    """What the NumPy way has cost this process beyond each module of kernels, and what has been decided."""
 
     def __init__(self) -> None:
         self.lock = Lock()
-        self.lost_s = 0.0
+        self.lost_s: dict[str, float] = {}
+        self.stored: dict[str, bool] = {}
+        self.taken: set[str] = set()
         self.usable: bool | None = None
         self.forced: bool | None = None
+
+    def paid(self, kernels: str) -> bool:
+        """Whether what was lost so far is worth these kernels."""
+        if kernels not in self.stored:
+            self.stored[kernels] = _stored(kernels)
+        if not self.stored[kernels]:
+            return self.lost_s[kernels] >= COMPILING_S
+        together = sum(lost for other, lost in self.lost_s.items() if self.stored.get(other))
+        return "numba" in sys.modules or together >= LOADING_S
 
 
 _ledger = _Ledger()
 
 
-def pays(saves_s: float) -> bool:
-    """Whether to take the kernels, for work that they do `saves_s` seconds sooner than NumPy.
+def pays(saves_s: float, kernels: str) -> bool:
+    """Whether to take the kernels of a module of this package, for work that they do `saves_s` seconds sooner.
 
+    Parameters
+    ----------
+    kernels
+        The module's name within the package, as "detect.plane_kernels".
+
+    Returns
+    -------
     True means that numba has been imported. Where the answer is no, the saving counts as lost, so that enough small
     pieces of work bring a later yes.
     """
     with _ledger.lock:
         if _ledger.forced is not None:
             return _ledger.forced
-        if _ledger.usable is None and "numba" not in sys.modules:
-            _ledger.lost_s += saves_s
-            if _ledger.lost_s < (LOADING_S if _any_stored() else COMPILING_S):
-                return False
+        if _ledger.usable is False or kernels in _ledger.taken:
+            return _ledger.usable is True
+        _ledger.lost_s[kernels] = _ledger.lost_s.get(kernels, 0.0) + saves_s
+        if not _ledger.paid(kernels):
+            return False
         if _ledger.usable is None:
             _ledger.usable = _importable()
+        _ledger.taken.add(kernels)
         return _ledger.usable
 
 
@@ -107,19 +127,25 @@ def _importable() -> bool:
     return True
 
 
-def _any_stored() -> bool:
-    """Whether an earlier process has stored kernels for this Python: beside this package's byte code, or in a cache."""
-    tag = f"*kernels.*.py{sys.version_info.major}{sys.version_info.minor}*.nbi"
-    return any(next(folder.glob(f"{depth}/{tag}"), None) is not None for folder, depth in _stores())
+def _stored(kernels: str) -> bool:
+    """Whether an earlier process has stored kernels of this module, as it is now, for this Python."""
+    package, module = kernels.split(".")
+    source = Path(__file__).parents[1] / package / f"{module}.py"
+    tag = f"{module}.*.py{sys.version_info.major}{sys.version_info.minor}*.nbi"
+    try:
+        changed = source.stat().st_mtime
+        return any(index.stat().st_mtime >= changed for folder in _stores(package) for index in folder.glob(tag))
+    except OSError:
+        return False
 
 
-def _stores() -> list[tuple[Path, str]]:
-    """Folders in which numba stores, and where below them."""
-    found = [(Path(__file__).parents[1], "*/__pycache__")]
+def _stores(package: str) -> list[Path]:
+    """Folders in which numba stores kernels of a package's modules: beside their byte code, or in a cache."""
+    beside = [Path(__file__).parents[1] / package / "__pycache__"]
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
-        return [(Path(chosen), "*")]
+        return list(Path(chosen).glob(f"{package}_*"))
     try:
         cache = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     except RuntimeError:  # a user without a home
-        return found
-    return [*found, (Path(cache) / "numba", "*")]
+        return beside
+    return [*beside, *(Path(cache) / "numba").glob(f"{package}_*")]

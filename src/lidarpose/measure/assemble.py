@@ -119,7 +119,7 @@ def readings_between(recording: SweepRecording, first: int = 0, last: int | None
 
 def pays_to_compile(recording: SweepRecording) -> bool:
     """Whether to assemble the whole recording by kernels."""
-    return pays(SAVED_S_PER_POINT * recording.range_m.size)
+    return pays(SAVED_S_PER_POINT * recording.range_m.size, "measure.kernels")
 
 
 def compact(
