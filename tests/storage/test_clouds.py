@@ -20,6 +20,7 @@ from lidarpose.errors import InputError
 from lidarpose.model.cloud import Cloud
 from lidarpose.storage.clouds import (
     CLOUD_SUFFIXES,
+    look_at_points,
     looks_like_millimetres,
     lzf,
     open_cloud_writer,
@@ -465,3 +466,31 @@ def test_millimetres_are_noticed() -> None:
         assert not looks_like_millimetres(Cloud(metres))
         assert looks_like_millimetres(Cloud(metres * 1000.0))
     assert not looks_like_millimetres(Cloud(np.full((3, 3), np.nan)))
+
+
+@pytest.mark.parametrize("suffix", CLOUD_SUFFIXES)
+def test_points_that_are_only_looked_at_are_those_that_are_read(tmp_path: Path, suffix: str) -> None:
+    """Of files with further columns and without, one after the other, so that lent memory is used again."""
+    for name, cloud in (("a", make_cloud(700)), ("b", Cloud(make_cloud(300).points)), ("c", Cloud(np.zeros((1, 3))))):
+        path = tmp_path / f"{name}{suffix}"
+        write_cloud(path, cloud)
+        np.testing.assert_array_equal(look_at_points(path, np.copy), read_cloud(path).points)
+
+
+def test_packed_rows_that_lie_otherwise_than_side_by_side_are_looked_at_all_the_same(tmp_path: Path) -> None:
+    rows = np.zeros(5, dtype=[("z", "<f4"), ("tag", "u1"), ("y", "<f4"), ("x", "<f4")])
+    rows["x"], rows["y"], rows["z"] = np.arange(15.0).reshape(3, 5)
+    head = "FIELDS z tag y x\nSIZE 4 1 4 4\nTYPE F U F F\nCOUNT 1 1 1 1\nWIDTH 5\nHEIGHT 1\nPOINTS 5\nDATA binary\n"
+    (tmp_path / "a.pcd").write_bytes(head.encode() + rows.tobytes())
+    np.testing.assert_array_equal(look_at_points(tmp_path / "a.pcd", np.copy), np.arange(15.0).reshape(3, 5).T)
+
+
+@pytest.mark.parametrize("suffix", [".pcd", ".ply"])
+def test_a_file_that_is_cut_off_cannot_be_looked_at(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    write_cloud(path, make_cloud(100))
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(InputError, match=r"promises|more than"):
+        look_at_points(path, len)
+    with pytest.raises(InputError, match="cannot be read"):
+        look_at_points(tmp_path / f"none{suffix}", len)

@@ -254,7 +254,7 @@ class FaceMask:
             mine = np.flatnonzero(face == j)
             on_face = predicted[mine]
             mine = chosen[mine]
-            good = self._inside(j, rays[:, mine] * on_face, slope[:, mine] * on_face)
+            good = self._inside(j, rays.take(mine, axis=1) * on_face, slope.take(mine, axis=1) * on_face)
             indices.append(mine[good])
             faces.append(np.full(int(np.count_nonzero(good)), j))
         return np.concatenate(indices), np.concatenate(faces)
@@ -336,10 +336,8 @@ class FaceMask:
 
 def in_outline(points: FloatArray, outline: FloatArray, normal: FloatArray, slack_m: float) -> BoolArray:
     """Which points (3, N) of a plane lie in a convex outline (K, 3), widened by `slack_m`."""
-    good = np.ones(points.shape[1], dtype=bool)
-    for edge, offset in zip(*_edges(outline, normal, slack_m), strict=True):
-        good &= edge @ points > offset
-    return good
+    inward, least = _edges(outline, normal, slack_m)
+    return np.asarray((inward @ points > least[:, None]).all(axis=0))
 
 
 def _edges(outline: FloatArray, normal: FloatArray, slack_m: float) -> tuple[FloatArray, FloatArray]:

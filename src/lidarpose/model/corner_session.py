@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, TypeGuard, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray, as_float_array
@@ -12,6 +16,8 @@ from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.scan import LidarSpec
+
+Result = TypeVar("Result")
 
 CloudFrame = Literal["lidar", "camera"]
 """The frame of a session's clouds: "camera" for clouds assembled from a spun 2D LiDAR."""
@@ -30,7 +36,16 @@ class CloudSource(Protocol):
         ...
 
 
-@runtime_checkable
+def look_at_points(source: CloudSource, look: Callable[[NDArray[np.floating[Any]]], Result]) -> Result:
+    """What `look` makes of a cloud's points (N, 3), of which it keeps nothing but copies.
+
+    A source that has a method `look` may show it points in memory that is used again. Raises InputError if the cloud is
+    missing or unreadable.
+    """
+    own: Callable[[Callable[[NDArray[np.floating[Any]]], Result]], Result] | None = getattr(source, "look", None)
+    return look(source.load().points) if own is None else own(look)
+
+
 class RecordingSource(Protocol):
     """A sweep recording somewhere in place of a cloud: it becomes one by its turntable's calibration."""
 
@@ -40,6 +55,11 @@ class RecordingSource(Protocol):
     def recording(self) -> SweepRecording:
         """Open it. Raises InputError if it is missing or unreadable."""
         ...
+
+
+def is_recording(source: CloudSource | RecordingSource) -> TypeGuard[RecordingSource]:
+    """Whether a source is a recording, not yet a cloud."""
+    return hasattr(source, "recording")
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +118,7 @@ class CornerSession:
     @property
     def has_recordings(self) -> bool:
         """Whether any place holds a sweep recording."""
-        return any(isinstance(source, RecordingSource) for place in self.places for source in place.clouds)
+        return any(is_recording(source) for place in self.places for source in place.clouds)
 
 
 @dataclass(frozen=True, eq=False)

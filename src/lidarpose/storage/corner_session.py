@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from lidarpose.errors import InputError
@@ -28,6 +29,8 @@ from lidarpose.storage.session import CORNER_SESSION_FORMAT, LidarSection, insid
 from lidarpose.storage.session_folder import check_free
 from lidarpose.storage.tables import TextTable, read_text_table
 from lidarpose.storage.truth import truth_path
+
+Result = TypeVar("Result")
 
 CLOUD_SUFFIXES = (".pcd", ".ply", ".las", ".laz", ".e57", ".npy")
 MAX_PLACES = 10_000
@@ -68,6 +71,12 @@ class FileCloud:
         from lidarpose.storage.clouds import read_cloud
 
         return read_cloud(self.path)
+
+    def look(self, at: Callable[[NDArray[np.floating[Any]]], Result]) -> Result:
+        """What `at` makes of the points (N, 3), which it does not keep. Raises InputError as `load` does."""
+        from lidarpose.storage.clouds import look_at_points
+
+        return look_at_points(self.path, at)
 
 
 @dataclass(frozen=True)

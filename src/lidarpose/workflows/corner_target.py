@@ -17,7 +17,7 @@ from lidarpose.detect.trihedral_corner import FaceMask, find_corners
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
-from lidarpose.model.corner_session import NEAR_RADIUS_M, CornerPlace, CornerSession
+from lidarpose.model.corner_session import NEAR_RADIUS_M, CornerPlace, CornerSession, look_at_points
 from lidarpose.model.observation import LeftOut
 from lidarpose.refine.corner_model import FreeCorner, fit_corner
 from lidarpose.refine.face_screening import without_foreign_spots
@@ -346,7 +346,7 @@ def gather(session: CornerSession, found: FoundTarget, *, tick: Tick = lambda: N
             low, high = outlines.min(axis=0) - margin_m, outlines.max(axis=0) + margin_m
         parts = []
         for source in place.clouds:
-            parts.append(inside_box(source.load().points, low, high))
+            parts.append(look_at_points(source, lambda points: inside_box(points, low, high)))
             tick()
         frame = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
         return PlaceCrop(np.concatenate(parts, dtype=np.float64), frame, len(parts))

@@ -9,7 +9,7 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.cloud import Cloud
-from lidarpose.model.corner_session import CloudSource, CornerSession, RecordingSource
+from lidarpose.model.corner_session import CloudSource, CornerSession, RecordingSource, is_recording
 from lidarpose.workflows.scanning import ScanOptions, assemble_scan
 
 
@@ -60,7 +60,7 @@ def with_scans(session: CornerSession, *, never_stops: bool = False) -> CornerSe
         )
 
     def scanned(source: CloudSource) -> CloudSource:
-        return ScannedCloud(source, turntable, never_stops) if isinstance(source, RecordingSource) else source
+        return ScannedCloud(source, turntable, never_stops) if is_recording(source) else source
 
     places = tuple(replace(place, clouds=tuple(map(scanned, place.clouds))) for place in session.places)
     return replace(session, places=places)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.model.calibration import WorldCalibration
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import CornerSession
@@ -38,7 +38,7 @@ def joint_run(
     places = []
     for place, corner in zip(used, own, strict=True):
         corners = by_frame.get(place.position, np.zeros((0, 3)))
-        kept = np.isin(np.arange(len(corners)), _frames(place.faces))
+        kept = _has_returns(place)[: len(corners)]
         faces = {k: _points(returns) for k, returns in sorted(place.faces.items())}
         places.append(WorldPlace(place.position, place.corner_world, corner, faces, corners, kept))
     return WorldRun("joint", session, calibration, tuple(places), fit.state.normals)
@@ -59,8 +59,12 @@ def corners_run(
     return WorldRun(method, session, calibration, tuple(places))
 
 
-def _frames(faces: Mapping[int, FaceReturns]) -> FloatArray:
-    return np.unique(np.concatenate([returns.frame for returns in faces.values()]))
+def _has_returns(place: CornerPlaceFaces) -> BoolArray:
+    """Which frames (F,) have any on the faces."""
+    found = np.zeros(place.frames, dtype=bool)
+    for returns in place.faces.values():
+        found[returns.frame] = True
+    return found
 
 
 def _points(returns: FaceReturns) -> FloatArray:

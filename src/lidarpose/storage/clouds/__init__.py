@@ -6,19 +6,22 @@ without return so) are kept; `Cloud.finite` drops them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import DTypeLike
+from numpy.typing import DTypeLike, NDArray
 
 from lidarpose.errors import InputError
 from lidarpose.model.cloud import Cloud
 from lidarpose.storage.atomic import replacing
 from lidarpose.storage.clouds.columns import CloudWriter, Columns
 from lidarpose.storage.limits import file_size
+
+Result = TypeVar("Result")
 
 # Modules are named as text: LAS and E57 libraries are imported only where such a file is met.
 _FORMATS = {
@@ -65,6 +68,28 @@ def read_cloud(path: Path) -> Cloud:
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror or error}") from error
     return cloud
+
+
+def look_at_points(path: Path, look: Callable[[NDArray[np.floating[Any]]], Result]) -> Result:
+    """What `look` makes of the points (N, 3) that `read_cloud` would return, without memory for them.
+
+    `look` gets an array that may be written over once it has returned; it keeps nothing of it but copies.
+
+    Raises
+    ------
+    InputError
+        As `read_cloud` does.
+    """
+    path = Path(path)
+    lend = getattr(import_module(_format(path)), "lent", None)
+    points = None
+    if lend is not None:
+        file_size(path)
+        try:
+            points = lend(path)
+        except OSError as error:
+            raise InputError(path, f"cannot be read: {error.strerror or error}") from error
+    return look(read_cloud(path).points if points is None else points)
 
 
 def write_cloud(path: Path, cloud: Cloud) -> None:

@@ -7,6 +7,7 @@ import io
 import os
 import re
 import sys
+import threading
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -27,6 +28,8 @@ BLOCK_BYTES = 1 << 17
 
 
 RESERVED_FROM_BYTES = 1 << 20
+LENT_BYTES = 1 << 23
+"""Files of more bytes are read into memory of their own, which is given back."""
 
 
 class CloudWriter(Protocol):
@@ -150,6 +153,44 @@ def read_rows(path: Path, offset: int, row: np.dtype[Any], count: int, *, skip: 
             for name, column in fields.items():
                 column[block] = part[name]
     return Cloud(points, fields)
+
+
+class _Lent(threading.local):
+    """Memory of a thread's own into which rows are read that nobody keeps."""
+
+    def __init__(self) -> None:
+        self.memory = np.empty(0, dtype=np.uint8)
+
+    def bytes(self, size: int) -> NDArray[np.uint8]:
+        if len(self.memory) < size:
+            self.memory = np.empty(size, dtype=np.uint8)
+        return self.memory[:size]
+
+
+_lent = _Lent()
+
+
+def lent_points(path: Path, offset: int, row: np.dtype[Any], count: int) -> NDArray[np.floating[Any]] | None:
+    """Points (N, 3) of `count` rows from a byte offset where they lie among the other columns, in memory of the calling
+    thread that its next call writes over; None where they are too many or lie otherwise than side by side.
+
+    Raises
+    ------
+    InputError
+        If x, y or z is missing, or fewer rows are there.
+    """
+    single = _require_coordinates(row, path)
+    kind = np.dtype(np.float32 if single else np.float64)
+    if count * row.itemsize > LENT_BYTES or any(row[name] != kind for name in XYZ):
+        return None
+    places = [row.fields[name][1] for name in XYZ] if row.fields else []
+    if places != [places[0] + k * kind.itemsize for k in range(3)] or (places[0] | row.itemsize) % kind.itemsize:
+        return None
+    memory = _lent.bytes(count * row.itemsize)
+    with path.open("rb", buffering=0) as file:
+        file.seek(offset)
+        _require_all(path, _fill(file, memory.data) // max(row.itemsize, 1), count)
+    return np.ndarray((count, 3), kind, memory.data, places[0], (row.itemsize, kind.itemsize))
 
 
 def _fill(file: io.FileIO, target: memoryview) -> int:

@@ -7,11 +7,23 @@ from pathlib import Path
 from lidarpose.errors import InputError
 from lidarpose.storage.limits import MAX_HEADER_BYTES, MAX_POINTS
 
+# Enough for most headers; reading as much as the longest takes would cost as long as parsing does.
+USUAL_HEADER_BYTES = 1 << 12
+
 
 def read_header_lines(path: Path, last: str) -> tuple[list[str], int]:
     """The header's lines up to the one whose first word is `last`, and the byte offset of what follows."""
-    with path.open("rb") as file:
-        head = file.read(MAX_HEADER_BYTES)
+    with path.open("rb", buffering=0) as file:
+        for size in (USUAL_HEADER_BYTES, MAX_HEADER_BYTES):
+            file.seek(0)
+            found = _lines_until(file.read(size), last)
+            if found is not None:
+                return found
+    raise InputError(path, f"has no line {last!r} within its first {MAX_HEADER_BYTES} bytes", expected="a whole header")
+
+
+def _lines_until(head: bytes, last: str) -> tuple[list[str], int] | None:
+    """The lines up to the one whose first word is `last`, and where it ends; None if it is not there as a whole."""
     lines: list[str] = []
     start = 0
     while (end := head.find(b"\n", start)) >= 0:
@@ -20,7 +32,7 @@ def read_header_lines(path: Path, last: str) -> tuple[list[str], int]:
         start = end + 1
         if line.split(maxsplit=1)[:1] == [last]:
             return lines, start
-    raise InputError(path, f"has no line {last!r} within its first {MAX_HEADER_BYTES} bytes", expected="a whole header")
+    return None
 
 
 def whole_number(path: Path, field: str, text: str, *, low: int = 0, high: int = MAX_POINTS) -> int:

@@ -21,7 +21,15 @@ from lidarpose.errors import InputError
 from lidarpose.model.cloud import Cloud
 from lidarpose.storage.atomic import replacing
 from lidarpose.storage.clouds import lzf
-from lidarpose.storage.clouds.columns import RGB, Columns, CountedFile, cloud_of_rows, parse_table, read_rows
+from lidarpose.storage.clouds.columns import (
+    RGB,
+    Columns,
+    CountedFile,
+    cloud_of_rows,
+    lent_points,
+    parse_table,
+    read_rows,
+)
 from lidarpose.storage.clouds.headers import fill, read_header_lines, whole_number
 from lidarpose.storage.limits import file_size, require_bytes
 
@@ -51,10 +59,20 @@ def read(path: Path) -> Cloud:
         require_bytes(path, "POINTS", header.points * numbers * 2 - 1, available)
         cloud = cloud_of_rows(_read_ascii(path, header), path, skip=header.padding)
     elif header.data == "binary":
-        cloud = _read_binary(path, header, available)
+        _check_binary(path, header, available)
+        cloud = read_rows(path, header.offset, header.row, header.points, skip=header.padding)
     else:
         cloud = cloud_of_rows(_read_compressed(path, header, available), path, skip=header.padding)
     return unpack_colours(cloud)
+
+
+def lent(path: Path) -> NDArray[np.floating[Any]] | None:
+    """The points of a binary file in memory that the next call writes over (see `columns.lent_points`), if possible."""
+    header = _read_header(path)
+    if header.data != "binary":
+        return None
+    _check_binary(path, header, file_size(path) - header.offset)
+    return lent_points(path, header.offset, header.row, header.points)
 
 
 def _read_header(path: Path) -> _Header:
@@ -126,11 +144,11 @@ def _read_ascii(path: Path, header: _Header) -> NDArray[Any]:
     return rows
 
 
-def _read_binary(path: Path, header: _Header, available: int) -> Cloud:
+def _check_binary(path: Path, header: _Header, available: int) -> None:
     needed = header.points * header.row.itemsize
     require_bytes(path, "POINTS", needed, available)
-    _require_padding(path, header.offset + needed)
-    return read_rows(path, header.offset, header.row, header.points, skip=header.padding)
+    if available != needed:
+        _require_padding(path, header.offset + needed)
 
 
 def _read_compressed(path: Path, header: _Header, available: int) -> NDArray[Any]:

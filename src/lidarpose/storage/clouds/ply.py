@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lidarpose.errors import InputError
 from lidarpose.model.cloud import Cloud
-from lidarpose.storage.clouds.columns import Columns, CountedFile, cloud_of_rows, parse_table, read_rows
+from lidarpose.storage.clouds.columns import Columns, CountedFile, cloud_of_rows, lent_points, parse_table, read_rows
 from lidarpose.storage.clouds.headers import fill, read_header_lines, whole_number
 from lidarpose.storage.limits import file_size, require_bytes
 
@@ -46,6 +46,23 @@ class _Element:
 
 def read(path: Path) -> Cloud:
     """Read the vertices of a PLY file."""
+    order, offset, dtype, before, vertex, after = _read_layout(path)
+    if order:
+        start = _binary_start(path, offset, dtype, before, vertex, after)
+        return read_rows(path, start, dtype, vertex.count)
+    return cloud_of_rows(_read_ascii(path, offset, dtype, before, vertex, after), path)
+
+
+def lent(path: Path) -> NDArray[np.floating[Any]] | None:
+    """The points of a binary file in memory that the next call writes over (see `columns.lent_points`), if possible."""
+    order, offset, dtype, before, vertex, after = _read_layout(path)
+    if not order:
+        return None
+    return lent_points(path, _binary_start(path, offset, dtype, before, vertex, after), dtype, vertex.count)
+
+
+def _read_layout(path: Path) -> tuple[str, int, np.dtype[Any], list[_Element], _Element, list[_Element]]:
+    """Byte order, where the elements begin, a vertex as a row, and the elements before it, itself, and after it."""
     order, elements, offset = _read_header(path)
     before = []
     for element in elements:
@@ -58,9 +75,7 @@ def read(path: Path) -> Cloud:
     if vertex.has_list:
         raise InputError(path, "has a list among its properties", field="element vertex", expected="numbers alone")
     dtype = np.dtype([(name, (order or "=") + code) for name, code in vertex.properties])
-    if order:
-        return _read_binary(path, offset, dtype, before, vertex, after)
-    return cloud_of_rows(_read_ascii(path, offset, dtype, before, vertex, after), path)
+    return order, offset, dtype, before, vertex, after
 
 
 def _read_header(path: Path) -> tuple[str, list[_Element], int]:
@@ -102,14 +117,15 @@ def _add_property(path: Path, place: str, element: _Element, words: list[str]) -
     element.least_numbers += 1
 
 
-def _read_binary(
+def _binary_start(
     path: Path,
     offset: int,
     dtype: np.dtype[Any],
     before: list[_Element],
     vertex: _Element,
     after: list[_Element],
-) -> Cloud:
+) -> int:
+    """Where the vertices begin in a file that holds exactly what its header promises."""
     if lists := [element.name for element in before if element.has_list]:
         raise InputError(path, f"has lists in {lists[0]} before the vertices", expected="the vertices first")
     start = offset + sum(element.count * element.least_bytes for element in before)
@@ -119,7 +135,7 @@ def _read_binary(
     if size - offset != least and not any(element.has_list for element in after):
         extra = size - offset - least
         raise InputError(path, f"has {extra} bytes more than its elements take", expected="the promised elements alone")
-    return read_rows(path, start, dtype, vertex.count)
+    return start
 
 
 def _read_ascii(
