@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from lidarpose.detect.plane_claims import Ahead, Claim, Slab, patches_of_slabs
+from lidarpose.detect.plane_claims import Claim, Slab, patches_of_slabs
 from lidarpose.geometry import compiled
 from lidarpose.geometry.arrays import BoolArray, FloatArray, angle_between
 from lidarpose.geometry.planes import Plane, fit_plane
@@ -28,7 +28,7 @@ def face(n: int, rng: np.random.Generator) -> FloatArray:
 
 
 def claims(points: FloatArray, free: BoolArray | None, slabs: list[Slab]) -> list[Claim | None]:
-    return patches_of_slabs(points, free, slabs, ahead=Ahead.where_it_pays(points))
+    return patches_of_slabs(points, free, slabs)
 
 
 def rough(points: FloatArray, seed: int) -> Slab:

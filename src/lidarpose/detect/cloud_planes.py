@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpose.detect.plane_claims import Ahead, Slab, patches_of_slabs
+from lidarpose.detect.plane_claims import Slab, patches_of_slabs
 from lidarpose.detect.plane_raster import cell_size_m, grown, mean_and_covariance, raster_of
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
@@ -156,7 +156,6 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
     free = np.ones(len(x), dtype=bool)
     patches: list[PlanePatch] = []
     sigma_m: float | None = None
-    ahead = Ahead.where_it_pays(x) if len(x) > DENSE else None
     settled = not search.bent
     for _ in range(search.max_rounds):
         at_most = search.max_planes - len(patches)
@@ -164,7 +163,7 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
         if count < max(least, POINTS_PER_HYPOTHESIS) or at_most <= 0:
             break
         if count > DENSE:
-            found, near_m = _harvest_dense(x, free, count, sigma_m, search, least, at_most, rng, ahead)
+            found, near_m = _harvest_dense(x, free, count, sigma_m, search, least, at_most, rng)
         else:
             x = np.ascontiguousarray(x, dtype=np.float32)
             sample = _draw(x, np.flatnonzero(free), sigma_m, search, rng)
@@ -193,7 +192,6 @@ def _harvest_dense(
     least: int,
     at_most: int,
     rng: np.random.Generator,
-    ahead: Ahead | None,
 ) -> tuple[list[PlanePatch], float]:
     """Patches of the `count` free points of a cloud so dense that a subsample shows them; the whole cloud is asked
     once for all of them. With them the spread of neighbouring points."""
@@ -213,7 +211,7 @@ def _harvest_dense(
         return [], sample.sigma_m
     found = []
     among = None if count == len(x) else free
-    claims = patches_of_slabs(x, among, slabs, WIDEST * sample.sigma_m, ahead)
+    claims = patches_of_slabs(x, among, slabs, WIDEST * sample.sigma_m)
     for before, claim in zip(seen, claims, strict=True):
         if claim is None or len(claim.patch) < least:
             continue

@@ -200,15 +200,13 @@ class _Terms:
 
 
 @dataclass(frozen=True, eq=False)
-class _Positions:
-    """Claims as kernels make them: positions `index` (M,) in a block with the points `columns` (3, N) from number
-    `first` on, which `times` (N,) say how many hold; what else is known of them is worked out if it is asked for."""
+class _Held:
+    """Claims as kernels make them: of the points from number `first` on those at the positions `index` (M,), all of
+    them in the patch's cells, with their terms but the first."""
 
-    slab: Slab
-    columns: Float32Array
-    times: NDArray[np.uint8]
     first: int
     index: NDArray[np.uint32]
+    along: tuple[Float32Array, Float32Array, Float32Array]
     disputed: NDArray[np.integer]
 
     @property
@@ -217,10 +215,7 @@ class _Positions:
 
     @cached_property
     def terms(self) -> Float32Array:
-        rows = self.slab.rows[:4].astype(np.float32)
-        terms = rows[:, :3] @ self.columns.take(self.index, axis=1)
-        terms += rows[:, 3:]
-        return terms
+        return np.stack([np.ones(len(self.index), dtype=np.float32), *self.along])
 
     @property
     def held(self) -> BoolArray:
@@ -235,22 +230,22 @@ class _Positions:
     def some_rest(self, every: int, lean: FloatArray) -> Float32Array:
         from lidarpose.detect.plane_kernels import heights_of_some
 
-        row = self.slab.turned(lean).astype(np.float32)
-        return np.asarray(heights_of_some(self.columns, self.index, _runs(every, RUN), row))
+        return np.asarray(heights_of_some(self.index, *self.along, every | 1, RUN, lean.astype(np.float32)))
 
     def moments(self, slab: Slab, lean: FloatArray) -> FloatArray:
         from lidarpose.detect.plane_kernels import moments_of
 
-        rows, gate_m = slab.rows[1:].astype(np.float32), GATE_SIGMAS * slab.sigma_m
-        return np.asarray(moments_of(self.columns, self.index, self.times, rows, lean, gate_m, _NONE)[0])
+        gate_m = np.float32(GATE_SIGMAS * slab.sigma_m)
+        return np.asarray(moments_of(*self.along, self.disputed, lean.astype(np.float32), gate_m))
 
-    def only(self, keep: BoolArray) -> _Positions:
+    def only(self, keep: BoolArray) -> _Held:
         disputed = np.zeros(len(keep), dtype=bool)
         disputed[self.disputed] = True
-        return replace(self, index=self.index[keep], disputed=np.flatnonzero(disputed[keep]))
-
-
-_NONE = np.zeros(0, dtype=np.uint32)
+        height, along_u, along_v = self.along
+        along = height[keep], along_u[keep], along_v[keep]
+        # As kernels know it: for another type they would be compiled again.
+        places = np.flatnonzero(disputed[keep]).astype(np.uint32)
+        return replace(self, index=self.index[keep], along=along, disputed=places)
 
 
 @lru_cache(maxsize=64)
@@ -293,38 +288,6 @@ class Claim:
         return np.concatenate([claims.some(held // EVIDENCE_POINTS + 1) for claims, _ in self.parts])
 
 
-class Ahead:
-    """A cloud's blocks as the kernels want them, prepared by a thread of its own while a subsample is searched."""
-
-    def __init__(self, x: NDArray[np.floating]) -> None:
-        blocks = _blocks(x)
-        # One array: large ones come in large pages.
-        whole = np.empty((len(blocks) - 1, 3, BLOCK), dtype=np.float32)
-        last = np.empty((3, len(x[blocks[-1]])), dtype=np.float32)
-        self._columns: list[Float32Array] = [*whole, last]
-        pool = ThreadPoolExecutor(1)
-        self._filled = [pool.submit(_fill, x[b], c) for b, c in zip(blocks, self._columns, strict=True)]
-        pool.shutdown(wait=False)
-
-    @staticmethod
-    def where_it_pays(x: NDArray[np.floating]) -> Ahead | None:
-        """None where NumPy is to pass over the cloud."""
-        return Ahead(x) if pays(SAVED_S_PER_POINT * len(x), "detect.plane_kernels") else None
-
-    def columns(self, block: slice) -> Float32Array:
-        """Points of a block as rows (3, N)."""
-        k = block.start // BLOCK
-        self._filled[k].result()
-        columns: Float32Array = self._columns[k]
-        return columns
-
-
-def _fill(points: NDArray[np.floating], columns: Float32Array) -> None:
-    from lidarpose.detect.plane_kernels import fill_columns
-
-    fill_columns(np.ascontiguousarray(points), columns)
-
-
 def _blocks(x: NDArray[np.floating]) -> list[slice]:
     return [slice(first, min(first + BLOCK, len(x))) for first in range(0, len(x), BLOCK)]
 
@@ -334,7 +297,6 @@ def patches_of_slabs(
     free: BoolArray | None,
     slabs: Sequence[Slab],
     widest_m: float = np.inf,
-    ahead: Ahead | None = None,
 ) -> list[Claim | None]:
     """The patches of the whole cloud for those of a subsample, in their order.
 
@@ -345,8 +307,6 @@ def patches_of_slabs(
         Which of them may be taken; None for all.
     widest_m
         No patch spreads more.
-    ahead
-        The points as kernels want them; None for the way of NumPy.
 
     Returns
     -------
@@ -354,8 +314,9 @@ def patches_of_slabs(
     """
     blocks = _blocks(x)
     workers = min(os.cpu_count() or 1, len(blocks))
-    claim = partial(_claim, x, free, slabs) if ahead is None else _compiled_claims(ahead, free, slabs)
-    members_in = _members if ahead is None else _members_compiled
+    compiled = pays(SAVED_S_PER_POINT * len(x), "detect.plane_kernels")
+    claim = _compiled_claims(x, free, slabs) if compiled else partial(_claim, x, free, slabs)
+    members_in = _members_compiled if compiled else _members
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(claim, blocks))
         of_slabs = list(pool.map(_screened, slabs, ([part[k] for part in parts] for k in range(len(slabs)))))
@@ -411,31 +372,32 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
     return parts
 
 
-def _compiled_claims(ahead: Ahead, free: BoolArray | None, slabs: Sequence[Slab]) -> Callable[[slice], list[_Part]]:
+def _compiled_claims(
+    x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab]
+) -> Callable[[slice], list[_Part]]:
     """`_claim` by kernels, which drop what is not held."""
     from lidarpose.detect.plane_kernels import claims_of_block
 
-    gates = np.array([[CLAIM_SIGMAS * s.sigma_m, GATE_SIGMAS * s.sigma_m] for s in slabs])
-    rows = np.stack([s.rows[1:] for s in slabs])
-    rows[:, 0] /= gates[:, :1]
-    single = rows.astype(np.float32)
+    gates = np.array([GATE_SIGMAS * s.sigma_m for s in slabs], dtype=np.float32)
+    rows = np.stack([np.vstack([s.rows[1] / (CLAIM_SIGMAS * s.sigma_m), s.rows[1:]]) for s in slabs]).astype(np.float32)
     allowed = np.concatenate([s.allowed for s in slabs]).view(np.uint8)
     starts = np.cumsum([0] + [len(s.allowed) for s in slabs])
     widths = np.array([s.raster.shape[1] for s in slabs])
     all_free = np.zeros(0, dtype=bool)
 
     def claim(block: slice) -> list[_Part]:
-        columns = ahead.columns(block)
         of_block = all_free if free is None else free[block]
-        held, ends, disputed, theirs, moments, times = claims_of_block(
-            columns, of_block, single, allowed, starts, widths, gates
+        index, *along, ends, disputed, their_ends, moments = claims_of_block(
+            np.ascontiguousarray(x[block]), of_block, rows, allowed, starts, widths, gates
         )
         parts: list[_Part] = []
         first = first_disputed = 0
-        for k, slab in enumerate(slabs):
-            mine, doubtful = held[first : ends[k]], disputed[first_disputed : theirs[k]]
-            parts.append((_Positions(slab, columns, times, block.start, mine, doubtful), moments[k]))
-            first, first_disputed = ends[k], theirs[k]
+        for k in range(len(slabs)):
+            mine, theirs = slice(first, ends[k]), slice(first_disputed, their_ends[k])
+            height, along_u, along_v = (values[mine] for values in along)
+            held = _Held(block.start, index[mine], (height, along_u, along_v), disputed[theirs])
+            parts.append((held, moments[k]))
+            first, first_disputed = ends[k], their_ends[k]
         return parts
 
     return claim
@@ -527,12 +489,12 @@ def _members_compiled(block: slice, parts: Sequence[_Part], fits: Sequence[_Fit 
     """`_members` by kernels."""
     from lidarpose.detect.plane_kernels import members_of
 
-    taken = np.zeros(block.stop - block.start, dtype=bool)
+    taken = np.zeros(block.stop - block.start, dtype=np.uint8)
     members = []
     for (claims, _), fit in zip(parts, fits, strict=True):
-        if fit is None or not isinstance(claims, _Positions):
+        if fit is None or not isinstance(claims, _Held):
             members.append(np.zeros(0, dtype=np.int64))
             continue
-        row = (claims.slab.turned(fit.lean) / (GATE_SIGMAS * fit.sigma_m)).astype(np.float32)
-        members.append(members_of(claims.columns, claims.index, claims.disputed, row, claims.first, taken))
+        lean, gate_m = fit.lean.astype(np.float32), np.float32(GATE_SIGMAS * fit.sigma_m)
+        members.append(members_of(claims.index, *claims.along, claims.disputed, lean, gate_m, claims.first, taken))
     return members

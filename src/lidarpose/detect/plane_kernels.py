@@ -13,15 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.geometry.compiled import kernel
-
-
-@kernel
-def fill_columns(points: Any, columns: Any) -> None:
-    """Points (N, 3) as rows (3, N) in single precision."""
-    x, y, z = columns[0], columns[1], columns[2]
-    for i in range(len(points)):
-        x[i], y[i], z[i] = points[i, 0], points[i, 1], points[i, 2]
+from lidarpose.geometry.compiled import kernel, summing_kernel
 
 
 @kernel
@@ -33,100 +25,128 @@ def _near(x: Any, y: Any, z: Any, row: Any, near: Any) -> None:
 
 
 @kernel
-def _hold(x: Any, y: Any, z: Any, rows: Any, near: Any, width: int, allowed: Any, times: Any, index: Any) -> int:
-    """Write positions of those near points that lie in allowed cells to `index`, count holders of a point in `times`;
-    how many there are."""
+def _positions(near: Any, index: Any) -> int:
+    """Write positions of what is near to `index`; how many there are."""
     found = np.uint64(0)
     for k in range(len(near)):
         index[found] = k
         found += np.uint64(near[k])
-    u_x, u_y, u_z, u_1 = rows[3, 0], rows[3, 1], rows[3, 2], rows[3, 3]
-    v_x, v_y, v_z, v_1 = rows[4, 0], rows[4, 1], rows[4, 2], rows[4, 3]
+    return int(found)
+
+
+@kernel
+def _hold(x: Any, y: Any, z: Any, rows: Any, near: Any, width: int, allowed: Any, times: Any, terms: Any) -> int:
+    """Of the points at the positions `near` write those in allowed cells to `terms`, as position, height, u and v, and
+    count the holders of a point in `times`; how many there are."""
+    index, height, along_u, along_v = terms
+    h_x, h_y, h_z, h_1 = rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3]
+    u_x, u_y, u_z, u_1 = rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3]
+    v_x, v_y, v_z, v_1 = rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3]
+    m_x, m_y, m_z, m_1 = rows[3, 0], rows[3, 1], rows[3, 2], rows[3, 3]
+    n_x, n_y, n_z, n_1 = rows[4, 0], rows[4, 1], rows[4, 2], rows[4, 3]
     zero, border = np.float32(0.0), np.float32(width - 1)
     first, last, line = np.int32(0), np.int32(len(allowed) - 1), np.int32(width)
     kept = np.uint64(0)
-    for j in range(found):
-        i = np.uint64(index[np.uint64(j)])
-        u = u_x * x[i] + u_y * y[i] + u_z * z[i] + u_1
-        v = v_x * x[i] + v_y * y[i] + v_z * z[i] + v_1
+    for j in range(len(near)):
+        i = np.uint64(near[j])
+        p, q, r = x[i], y[i], z[i]
+        n = n_x * p + n_y * q + n_z * r + n_1
         # What lies outside ends on the border, which is never allowed, or beyond the first or last cell.
-        v = v if v > zero else zero
-        v = v if v < border else border
-        cell = np.int32(np.int32(u) * line + np.int32(v))
+        n = n if n > zero else zero
+        n = n if n < border else border
+        cell = np.int32(np.int32(m_x * p + m_y * q + m_z * r + m_1) * line + np.int32(n))
         cell = cell if cell > first else first
         cell = cell if cell < last else last
         mine = allowed[np.uint64(cell)]
         index[kept] = i
+        height[kept] = h_x * p + h_y * q + h_z * r + h_1
+        along_u[kept] = u_x * p + u_y * q + u_z * r + u_1
+        along_v[kept] = v_x * p + v_y * q + v_z * r + v_1
         times[i] += mine
         kept += np.uint64(mine)
     return int(kept)
 
 
-@kernel
-def moments_of(columns: Any, index: Any, times: Any, rows: Any, lean: Any, gate: float, disputed: Any) -> Any:
-    """The sums (4, 4) of products of (1, height, u, v) over those of the points (3, N) at `index` that nobody else
-    holds and whose height over the leant plane is within the gate, and how many others there are.
-
-    `times` (N,) says how many hold each point; positions in `index` of those with several are written to `disputed`,
-    unless that is empty.
-    """
-    x, y, z = columns[0], columns[1], columns[2]
+@summing_kernel
+def _add_moments(height: Any, along_u: Any, along_v: Any, lean: Any, gate: Any, sums: Any) -> None:
+    """Add the products of (1, height, u, v) of points whose height over the leant plane is within the gate, those of
+    the upper triangle, to `sums` (4, 4)."""
     lean_1, lean_u, lean_v = lean[0], lean[1], lean[2]
-    h_x, h_y, h_z, h_1 = rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3]
-    u_x, u_y, u_z, u_1 = rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3]
-    v_x, v_y, v_z, v_1 = rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3]
-    disputes = np.uint64(0)
     s_1 = s_h = s_u = s_v = s_hu = s_hv = s_uu = s_uv = s_vv = s_hh = 0.0
-    for j in range(len(index)):
-        i = np.uint64(index[j])
-        if times[i] > 1:
-            if len(disputed) > 0:
-                disputed[disputes] = j
-            disputes += np.uint64(1)
-            continue
-        h = np.float64(h_x * x[i] + h_y * y[i] + h_z * z[i] + h_1)
-        u = np.float64(u_x * x[i] + u_y * y[i] + u_z * z[i] + u_1)
-        v = np.float64(v_x * x[i] + v_y * y[i] + v_z * z[i] + v_1)
-        if abs(h - lean_1 - lean_u * u - lean_v * v) < gate:
-            s_1 += 1.0
-            s_h += h
-            s_u += u
-            s_v += v
-            s_hh += h * h
-            s_hu += h * u
-            s_hv += h * v
-            s_uu += u * u
-            s_uv += u * v
-            s_vv += v * v
-    sums = np.empty((4, 4))
-    sums[0, 0], sums[1, 1], sums[2, 2], sums[3, 3] = s_1, s_hh, s_uu, s_vv
-    sums[0, 1], sums[0, 2], sums[0, 3], sums[1, 2], sums[1, 3], sums[2, 3] = s_h, s_u, s_v, s_hu, s_hv, s_uv
-    sums[1, 0], sums[2, 0], sums[3, 0], sums[2, 1], sums[3, 1], sums[3, 2] = s_h, s_u, s_v, s_hu, s_hv, s_uv
-    return sums, int(disputes)
+    for j in range(len(height)):
+        apart = abs(height[j] - along_u[j] * lean_u - along_v[j] * lean_v - lean_1)
+        inside = 1.0 if apart < gate else 0.0
+        h, u, v = np.float64(height[j]), np.float64(along_u[j]), np.float64(along_v[j])
+        s_1 += inside
+        h_in, u_in, v_in = h * inside, u * inside, v * inside
+        s_h += h_in
+        s_u += u_in
+        s_v += v_in
+        s_hh += h_in * h
+        s_hu += h_in * u
+        s_hv += h_in * v
+        s_uu += u_in * u
+        s_uv += u_in * v
+        s_vv += v_in * v
+    sums[0, 0] += s_1
+    sums[0, 1] += s_h
+    sums[0, 2] += s_u
+    sums[0, 3] += s_v
+    sums[1, 1] += s_hh
+    sums[1, 2] += s_hu
+    sums[1, 3] += s_hv
+    sums[2, 2] += s_uu
+    sums[2, 3] += s_uv
+    sums[3, 3] += s_vv
 
 
 @kernel
-def claims_of_block(columns: Any, free: Any, rows: Any, allowed: Any, starts: Any, widths: Any, gates: Any) -> Any:
-    """What each of K slabs holds of a block of points (3, N), of those with `free` (N,), or of all where that is empty.
+def moments_of(height: Any, along_u: Any, along_v: Any, disputed: Any, lean: Any, gate: Any) -> Any:
+    """The sums (4, 4) of products of (1, height, u, v) over those points (M,) whose height over the leant plane (3,),
+    in single precision as the gate is, lies within that, without those at the positions `disputed`."""
+    sums, others = np.zeros((4, 4)), np.zeros((4, 4))
+    _add_moments(height, along_u, along_v, lean, gate, sums)
+    n = len(disputed)
+    h, u, v = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    for k in range(n):
+        at = np.uint64(disputed[k])
+        h[k], u[k], v[k] = height[at], along_u[at], along_v[at]
+    _add_moments(h, u, v, lean, gate, others)
+    for i in range(4):
+        for k in range(i, 4):
+            sums[i, k] -= others[i, k]
+            sums[k, i] = sums[i, k]
+    return sums
+
+
+@kernel
+def claims_of_block(points: Any, free: Any, rows: Any, allowed: Any, starts: Any, widths: Any, gates: Any) -> Any:
+    """What each of K slabs holds of a block of points (N, 3), of those with `free` (N,), or of all where that is empty.
 
     Parameters
     ----------
-    rows : (K, 5, 4), single precision
-        Take (x, y, z, 1) to the height in units of the gate for claims, to u and v, and to both in cells.
+    rows : (K, 6, 4), single precision
+        Take (x, y, z, 1) to the height in units of the gate for claims, the height, u and v, and both in cells.
     allowed, starts, widths
         All slabs' cells as one row of 0 and 1, where each slab's begin (K + 1,), and how many each has in a line (K,).
-    gates : (K, 2)
-        The gates for claims and for moments, metres.
+    gates : (K,), single precision
+        The gates for moments, metres.
 
     Returns
     -------
-    Positions of what is held, slab after slab, and where each slab's end (K,); the disputed ones among each slab's, and
-    where those end (K,); the moments (K, 4, 4); how many hold each point (N,).
+    Positions, heights, u and v (L,) of what is held, slab after slab, and where each slab's end (K,); the disputed ones
+    among each slab's, and where those end (K,); the moments (K, 4, 4).
     """
-    x, y, z = columns[0], columns[1], columns[2]
-    n, slabs = len(x), len(rows)
-    near, times = np.empty(n, np.uint8), np.zeros(n, np.uint8)
-    held = np.empty(2 * n, np.uint32)
+    n, slabs = len(points), len(rows)
+    x, y, z = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    flat = points.reshape(-1)
+    for i in range(n):
+        at = np.uint64(i) * np.uint64(3)
+        x[i], y[i], z[i] = flat[at], flat[at + np.uint64(1)], flat[at + np.uint64(2)]
+    near, times, index = np.empty(n, np.uint8), np.zeros(n, np.uint8), np.empty(n + 1, np.uint32)
+    size = 2 * n
+    held, height = np.empty(size, np.uint32), np.empty(size, np.float32)
+    along_u, along_v = np.empty(size, np.float32), np.empty(size, np.float32)
     ends, disputed_ends = np.empty(slabs, np.int64), np.empty(slabs, np.int64)
     total = 0
     for k in range(slabs):
@@ -134,60 +154,81 @@ def claims_of_block(columns: Any, free: Any, rows: Any, allowed: Any, starts: An
         if len(free) > 0:
             for i in range(n):
                 near[i] &= free[i]
-        if total + n + 1 > len(held):
-            more = np.empty(2 * (total + n), np.uint32)
-            more[:total] = held[:total]
-            held = more
+        found = _positions(near, index)
+        if total + found + 1 > size:
+            size = 2 * (total + n)
+            held, height = _longer(held, size), _longer(height, size)
+            along_u, along_v = _longer(along_u, size), _longer(along_v, size)
         cells = allowed[starts[k] : starts[k + 1]]
-        total += _hold(x, y, z, rows[k], near, widths[k], cells, times, held[total:])
+        terms = held[total:], height[total:], along_u[total:], along_v[total:]
+        total += _hold(x, y, z, rows[k, 1:], index[:found], widths[k], cells, times, terms)
         ends[k] = total
-    disputed, disputes, first = np.empty(total, np.uint32), 0, 0
-    sums = np.zeros((slabs, 4, 4))
-    scaled, level = rows.copy(), np.zeros(3)
+    disputed, disputes = np.empty(total + 1, np.uint32), np.uint64(0)
+    sums, level = np.zeros((slabs, 4, 4)), np.zeros(3, np.float32)
+    first = 0
     for k in range(slabs):
-        scaled[k, 0] *= np.float32(gates[k, 0])
-        mine = held[first : ends[k]]
-        sums[k], others = moments_of(columns, mine, times, scaled[k], level, gates[k, 1], disputed[disputes:])
-        disputes += others
+        begun = int(disputes)
+        for j in range(first, ends[k]):
+            disputed[disputes] = j - first
+            disputes += np.uint64(times[np.uint64(held[np.uint64(j)])] > 1)
+        mine = slice(first, ends[k])
+        theirs = disputed[begun : int(disputes)]
+        sums[k] = moments_of(height[mine], along_u[mine], along_v[mine], theirs, level, gates[k])
         first, disputed_ends[k] = ends[k], disputes
-    return held[:total].copy(), ends, disputed[:disputes].copy(), disputed_ends, sums, times
+    return held, height, along_u, along_v, ends, disputed[: int(disputes)].copy(), disputed_ends, sums
 
 
 @kernel
-def members_of(columns: Any, index: Any, disputed: Any, row: Any, first: int, taken: Any) -> Any:
-    """Numbers (M,), counted from `first`, of those of the points (3, N) at `index` that lie within 1 of a plane; of
-    those at the positions `disputed` only where `taken` (N,) is not yet set, which they then set."""
-    x, y, z = columns[0], columns[1], columns[2]
-    members = np.empty(len(index) + 1, np.int64)
-    a, b, c, d = row[0], row[1], row[2], row[3]
+def _longer(values: Any, size: int) -> Any:
+    more = np.empty(size, values.dtype)
+    more[: len(values)] = values
+    return more
+
+
+@kernel
+def members_of(
+    index: Any, height: Any, along_u: Any, along_v: Any, disputed: Any, lean: Any, gate: Any, first: int, taken: Any
+) -> Any:
+    """Numbers (M,), counted from `first`, of the points at the positions `index` whose height over the leant plane is
+    within the gate; of those at the places `disputed` only where `taken` is not yet set, which they then set."""
+    n = len(index)
+    mine = np.empty(n, np.uint8)
+    lean_1, lean_u, lean_v = lean[0], lean[1], lean[2]
+    for j in range(n):
+        mine[j] = abs(height[j] - along_u[j] * lean_u - along_v[j] * lean_v - lean_1) < gate
+    for k in range(len(disputed)):
+        at = np.uint64(disputed[k])
+        i = np.uint64(index[at])
+        first_taker = mine[at] & (taken[i] ^ 1)
+        taken[i] |= mine[at]
+        mine[at] = first_taker
+    members = np.empty(n + 1, np.int64)
     found = np.uint64(0)
-    start = 0
-    for part in range(len(disputed) + 1):
-        stop = int(disputed[part]) if part < len(disputed) else len(index)
-        for j in range(start, stop):
-            i = np.uint64(index[np.uint64(j)])
-            members[found] = first + np.int64(i)
-            found += np.uint64(abs(a * x[i] + b * y[i] + c * z[i] + d) < np.float32(1.0))
-        if part < len(disputed):
-            i = np.uint64(index[stop])
-            members[found] = first + np.int64(i)
-            if abs(a * x[i] + b * y[i] + c * z[i] + d) < np.float32(1.0):
-                found += np.uint64(not taken[i])
-                taken[i] = True
-        start = stop + 1
-    return members[:found]
+    for j in range(n):
+        members[found] = first + np.int64(index[j])
+        found += np.uint64(mine[j])
+    return members[: int(found)]
 
 
 @kernel
-def heights_of_some(columns: Any, index: Any, chosen: Any, row: Any) -> Any:
-    """Heights (M,) over a plane of those of the points (3, N) at `index` that are chosen (N,)."""
-    x, y, z = columns[0], columns[1], columns[2]
+def heights_of_some(index: Any, height: Any, along_u: Any, along_v: Any, every: int, run: int, lean: Any) -> Any:
+    """Heights (M,) over the leant plane of those points whose positions, ascending, lie in every so manieth run."""
     heights = np.empty(len(index), np.float32)
-    a, b, c, d = row[0], row[1], row[2], row[3]
-    found = 0
-    for j in range(len(index)):
-        i = np.uint64(index[j])
-        if chosen[i]:
-            heights[found] = a * x[i] + b * y[i] + c * z[i] + d
+    lean_1, lean_u, lean_v = lean[0], lean[1], lean[2]
+    found = j = begin = 0
+    while j < len(index):
+        # The first at or beyond a run, by halving.
+        low, high = j, min(j + max(begin - int(index[j]), 0), len(index))
+        while low < high:
+            middle = (low + high) // 2
+            if int(index[middle]) < begin:
+                low = middle + 1
+            else:
+                high = middle
+        j = low
+        while j < len(index) and int(index[j]) < begin + run:
+            heights[found] = height[j] - along_u[j] * lean_u - along_v[j] * lean_v - lean_1
             found += 1
+            j += 1
+        begin += run * every
     return heights[:found]
