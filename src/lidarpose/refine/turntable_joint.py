@@ -199,12 +199,12 @@ _NOT_RANDOM = 8.0
 def _solve(data: JointData, start: JointState, active: IntArray, max_iterations: int, *, with_places: bool) -> Solution:
     rows = len(data.stripes.pixels) + len(data.ranges.range_m)
     state, spent, earlier = start, 0, None
-    if rows > 4 * _COARSE_ROWS * (data.stripes.lines.count + data.ranges.lines.count):
+    if rows > 2 * _COARSE_ROWS * (data.stripes.lines.count + data.ranges.lines.count):
         # Most of the way on few rows of each line; the last steps on all of them.
         few = thinned(data, _COARSE_ROWS)
         coarse = _iterate(few, start, active, max_iterations, None, with_places)
         state, spent, earlier = coarse.at.state, coarse.iterations, coarse.noise
-        data = _with_growth(data, _growth(few, coarse))
+        data = _with_growth(data, _growth(data, _among_all(data, coarse)))
     done = _iterate(data, state, active, max_iterations, earlier, with_places)
     if earlier is None:
         growth = _growth(data, done)
@@ -216,6 +216,12 @@ def _solve(data: JointData, start: JointState, active: IntArray, max_iterations:
         moments = all_moments(data, done.at, noise)
         noise = update_noise(data, done.at, noise, moments, active, soft=False, with_places=True)
     return _finish(data, done.at, noise, active, spent + done.iterations, done.converged)
+
+
+def _among_all(data: JointData, coarse: _Progress) -> _Progress:
+    """An estimate on few rows, as it lies among all rows."""
+    at = linearise(data, coarse.at.state)
+    return replace(coarse, at=at, noise=carried_over(data, at, coarse.noise))
 
 
 def _growth(data: JointData, done: _Progress) -> dict[Kind, float]:
