@@ -114,11 +114,12 @@ class PanelAlbedo:
         usable = self.usable.copy()
         rows, columns = usable.shape
         polygon = other.astype(np.float32)
-        for j, i in np.argwhere(usable):
-            if 0 < i < columns - 1 and 0 < j < rows - 1:
-                continue
-            u, v = self.grid_map.pixels(_ring_centre(np.array([i, j]), np.array([columns, rows])))
-            if cv2.pointPolygonTest(polygon, (float(u), float(v)), False) >= 0:
+        ring = usable.copy()
+        ring[1:-1, 1:-1] = False
+        cells = np.argwhere(ring)[:, ::-1]
+        pixels = self.grid_map.pixels(_ring_centre(cells, np.array([columns, rows])))
+        for (i, j), (u, v) in zip(cells.tolist(), pixels.tolist(), strict=True):
+            if cv2.pointPolygonTest(polygon, (u, v), False) >= 0:
                 usable[j, i] = False
         return replace(self, usable=usable)
 

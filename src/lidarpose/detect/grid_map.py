@@ -39,7 +39,9 @@ class GridMap:
     def pixels(self, grid: ArrayLike) -> FloatArray:
         """Pixels (..., 2) of grid coordinates (..., 2)."""
         g = np.asarray(grid, dtype=np.float64)
-        return _apply_homography(self.homography, g) + self._terms(g) @ self.bend
+        found = _apply_homography(self.homography, g)
+        found += np.moveaxis(self._bent(*self._scaled(g)), 0, -1)
+        return found
 
     def jacobian(self, grid: ArrayLike) -> FloatArray:
         """Derivative (..., 2, 2) of the pixels by the grid coordinates, by central differences of 0.01 squares."""
@@ -73,11 +75,37 @@ class GridMap:
         sides = [a + s[:, None] * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
         return self.pixels(np.concatenate(sides))
 
-    def _terms(self, grid: FloatArray) -> FloatArray:
+    def _scaled(self, grid: FloatArray) -> FloatArray:
+        """Grid coordinates (2, ...) from -1 to 1 over the inner corners."""
         half = np.array([max(self.columns - 1, 1), max(self.rows - 1, 1)]) / 2.0
         # Well beyond the outer squares the bend stays as it is at their edge: a polynomial knows nothing out there.
         reach = 1.0 + 1.7 / half
-        s, t = np.moveaxis(np.clip(grid / half - 1.0, -reach, reach), -1, 0)
+        half, reach = (x.reshape(2, *[1] * (grid.ndim - 1)) for x in (half, reach))
+        return np.clip(np.moveaxis(grid, -1, 0) / half - 1.0, -reach, reach)
+
+    def _bent(self, s: FloatArray, t: FloatArray) -> FloatArray:
+        """The polynomial (2, ...) by Horner's scheme in both variables, in place: a fifth of the terms' time."""
+        degree = _DEGREES[len(self.bend)]
+        found = np.empty((2, *s.shape))
+        inner = np.empty((1, *s.shape))
+        for k in (0, 1):
+            last = len(self.bend)
+            total = found[k : k + 1]
+            total[...] = self.bend[last - 1, k]
+            for i in range(degree - 1, -1, -1):
+                # The coefficients of s^i times 1, t, t^2, ... stand together.
+                last -= degree - i
+                of_t = self.bend[last - (degree - i) - 1 : last, k]
+                inner[...] = of_t[-1]
+                for value in of_t[-2::-1]:
+                    inner *= t
+                    inner += value
+                total *= s
+                total += inner
+        return found
+
+    def _terms(self, grid: FloatArray) -> FloatArray:
+        s, t = self._scaled(grid)
         degree = _DEGREES[len(self.bend)]
         powers_s, powers_t = [np.ones_like(s)], [np.ones_like(t)]
         for _ in range(degree):
