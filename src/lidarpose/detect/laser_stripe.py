@@ -25,11 +25,13 @@ import numpy as np
 from lidarpose.detect.albedo import measure_albedo
 from lidarpose.detect.chessboard import BoardDetection
 from lidarpose.detect.stripe_fit import StripeFit, fit_stripes
-from lidarpose.detect.stripe_search import KERNELS, PanelView, find_line, has_line
+from lidarpose.detect.stripe_search import KERNELS, CoarseLine, PanelView, find_line, has_line
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.compiled import pays
 from lidarpose.model.image import GrayImage
 from lidarpose.model.observation import LeftOut, StripePoints
+
+Image = GrayImage | FloatArray
 
 # Margins within this many squares of another panel's inner corners are not used.
 _KEPT_APART = 3.0
@@ -86,8 +88,10 @@ class StripeFinder:
         pays(_SAVED_S_PER_STRIPE * len(images) * len(self._views), KERNELS)  # what follows asks again, for nothing more
         stripes: list[dict[int, StripePoints]] = [{} for _ in images]
         problems: list[list[LeftOut]] = [[] for _ in images]
+        # All panels of an image in turn, while it is in the cache.
+        lines = [[find_line(view, image) for view in self._views] for image in images]
         for k, view in enumerate(self._views):
-            for i, fit in enumerate(_fits(view, images, self._limit)):
+            for i, fit in enumerate(_fits(view, images, [found[k] for found in lines], self._limit)):
                 if isinstance(fit, str):
                     problems[i].append(LeftOut(f"stripe on panel {k + 1}", fit))
                 else:
@@ -95,9 +99,10 @@ class StripeFinder:
         return [StripeDetection(found, tuple(lost)) for found, lost in zip(stripes, problems, strict=True)]
 
 
-def _fits(view: PanelView, images: Sequence[GrayImage], limit: float) -> list[StripeFit | str]:
-    """The stripe on one panel in each image, or why there is none."""
-    lines = [find_line(view, image) for image in images]
+def _fits(
+    view: PanelView, images: Sequence[GrayImage], lines: Sequence[CoarseLine | str], limit: float
+) -> list[StripeFit | str]:
+    """The stripe on one panel near each image's line, or why there is none."""
     seen = [i for i, line in enumerate(lines) if not isinstance(line, str)]
     fits = fit_stripes(view, [images[i] for i in seen], [line for line in lines if not isinstance(line, str)], limit)
     found: list[StripeFit | str] = [line if isinstance(line, str) else "" for line in lines]
@@ -108,7 +113,7 @@ def _fits(view: PanelView, images: Sequence[GrayImage], limit: float) -> list[St
 
 def _combine(images: Sequence[GrayImage]) -> FloatArray:
     """One bright image (float32) of several shots: the median of three groups' means, deaf to what passes in one."""
-    shots = [np.asarray(image) for image in images]
+    shots: list[Image] = list(images)
     found = np.empty(shots[0].shape, dtype=np.float32)
     for first in range(0, len(found), _ROWS_AT_ONCE):
         # A few rows at a time stay in the cache.
@@ -116,12 +121,14 @@ def _combine(images: Sequence[GrayImage]) -> FloatArray:
     return found
 
 
-def _combined(shots: list[GrayImage]) -> GrayImage | FloatArray:
+def _combined(shots: Sequence[Image]) -> Image:
     if len(shots) == 3:
-        a, b, c = shots  # the median of three needs no other numbers than theirs
-    else:
-        shots = [np.asarray(shot, dtype=np.float32) for shot in shots]
-        if len(shots) < 3:
-            return np.asarray(sum(shots[1:], shots[0]) / np.float32(len(shots)))
-        a, b, c = (sum(shots[k + 3 :: 3], shots[k]) / np.float32(len(shots[k::3])) for k in range(3))
+        return _middle(*shots)  # no other numbers than theirs
+    levels: list[FloatArray] = [np.asarray(shot, dtype=np.float32) for shot in shots]
+    if len(levels) < 3:
+        return np.asarray(sum(levels[1:], levels[0]) / np.float32(len(levels)))
+    return _middle(*(sum(levels[k + 3 :: 3], levels[k]) / np.float32(len(levels[k::3])) for k in range(3)))
+
+
+def _middle(a: Image, b: Image, c: Image) -> Image:
     return np.asarray(np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)))

@@ -206,23 +206,37 @@ def ambient_products(
 
 
 @kernel
-def _looked_up(table: Any, index: Any) -> Any:
-    """The table's entry at an index that is kept within it and cut to a whole number."""
-    last = np.float32(len(table) - 1)
-    kept = index if index > np.float32(0.0) else np.float32(0.0)
-    kept = kept if kept < last else last
-    return table[np.uint64(np.int32(kept))]
+def _wave_entries(x: Any, scale: Any, low: Any, high: Any, last: Any, index: Any) -> None:
+    """Entries of a table with this `last` one that `albedo.soft_square_wave` has at x kept from `low` to `high`."""
+    one, two, half, none = np.float32(1.0), np.float32(2.0), np.float32(0.5), np.float32(0.0)
+    middle = half * last + half
+    for i in range(_PIECE):
+        kept = x[i] if x[i] > low else low
+        kept = kept if kept < high else high
+        turn = half * kept + np.float32(0.25)
+        distance = half - abs(two * (turn - np.floor(turn)) - one)
+        step = distance * scale[i] + middle
+        step = step if step > none else none
+        index[i] = np.int32(step if step < last else last)
 
 
 @kernel
-def _wave(x: Any, scale: Any, low: Any, high: Any, table: Any) -> Any:
-    """`albedo.soft_square_wave` at x, kept between `low` and `high`."""
-    one, two, half = np.float32(1.0), np.float32(2.0), np.float32(0.5)
-    kept = x if x > low else low
-    kept = kept if kept < high else high
-    turn = half * kept + np.float32(0.25)
-    distance = half - abs(two * (turn - np.floor(turn)) - one)
-    return _looked_up(table, distance * scale + np.float32(len(table) // 2 + 0.5))
+def _step_entries(x: Any, sign: Any, offset: Any, scale: Any, last: Any, index: Any) -> None:
+    """The same of `albedo._soft_step` at sign * x + offset."""
+    half, none = np.float32(0.5), np.float32(0.0)
+    middle = half * last + half
+    for i in range(_PIECE):
+        step = (sign * x[i] + offset) * scale[i] + middle
+        step = step if step > none else none
+        index[i] = np.int32(step if step < last else last)
+
+
+@kernel
+def _behind_edge(share: Any, table: Any, index: Any, count: int) -> None:
+    """Let shares become light beyond an edge, by the table's entries there."""
+    one, half = np.float32(1.0), np.float32(0.5)
+    for i in range(count):
+        share[i] = one - (one - share[i]) * (half + half * table[np.uint32(index[i])])
 
 
 @kernel
@@ -244,31 +258,51 @@ def light_shares(
     error function.
     """
     profile_pixels, bands, profiles = v.shape
-    one, half = np.float32(1.0), np.float32(0.5)
+    one, half, last = np.float32(1.0), np.float32(0.5), np.float32(len(table) - 1)
     sign = -half if first_is_dark else half
-    middle = np.float32(len(table) // 2 + 0.5)
     low, high_x, high_y = np.float32(-0.5), size[0] - half, size[1] - half
-    for p in range(profile_pixels):
-        for b in range(bands):
-            for n in range(profiles):
-                dv = v[p, b, n] - centre[b, n]
-                x, y = dv * per_v[0, b, n] + grid[0, b, n], dv * per_v[1, b, n] + grid[1, b, n]
-                scale_x, scale_y = scales[0, b, n], scales[1, b, n]
-                wave = _wave(x, scale_x, low, high_x, table) * _wave(y, scale_y, low, high_y, table)
-                share = half + sign * wave
+    piece = _PIECE
+    s = np.zeros(11 * _PIECE, np.float32)
+    at, centres = s[:piece], s[piece : 2 * piece]
+    x0, y0 = s[2 * piece : 3 * piece], s[3 * piece : 4 * piece]
+    slope_x, slope_y = s[4 * piece : 5 * piece], s[5 * piece : 6 * piece]
+    scale_x, scale_y, share = s[6 * piece : 7 * piece], s[7 * piece : 8 * piece], s[8 * piece : 9 * piece]
+    x, y = s[9 * piece : 10 * piece], s[10 * piece :]
+    index = np.zeros(2 * _PIECE, np.int32)
+    index_x, index_y = index[:piece], index[piece:]
+    for b in range(bands):
+        for first in range(0, profiles, piece):
+            end = min(first + piece, profiles)
+            count = end - first
+            _copy(centre[b, first:end], centres, count)
+            _copy(grid[0, b, first:end], x0, count)
+            _copy(grid[1, b, first:end], y0, count)
+            _copy(per_v[0, b, first:end], slope_x, count)
+            _copy(per_v[1, b, first:end], slope_y, count)
+            _copy(scales[0, b, first:end], scale_x, count)
+            _copy(scales[1, b, first:end], scale_y, count)
+            for p in range(profile_pixels):
+                _copy(v[p, b, first:end], at, count)
+                for i in range(piece):
+                    x[i] = (at[i] - centres[i]) * slope_x[i] + x0[i]
+                    y[i] = (at[i] - centres[i]) * slope_y[i] + y0[i]
+                _wave_entries(x, scale_x, low, high_x, last, index_x)
+                _wave_entries(y, scale_y, low, high_y, last, index_y)
+                for i in range(count):
+                    share[i] = half + sign * (table[np.uint32(index_x[i])] * table[np.uint32(index_y[i])])
                 if near[0, 0]:
-                    step = half + half * _looked_up(table, (x + one) * scale_x + middle)
-                    share = one - (one - share) * step
+                    _step_entries(x, one, one, scale_x, last, index_x)
+                    _behind_edge(share, table, index_x, count)
                 if near[0, 1]:
-                    step = half + half * _looked_up(table, (size[0] - x) * scale_x + middle)
-                    share = one - (one - share) * step
+                    _step_entries(x, -one, size[0], scale_x, last, index_x)
+                    _behind_edge(share, table, index_x, count)
                 if near[1, 0]:
-                    step = half + half * _looked_up(table, (y + one) * scale_y + middle)
-                    share = one - (one - share) * step
+                    _step_entries(y, one, one, scale_y, last, index_y)
+                    _behind_edge(share, table, index_y, count)
                 if near[1, 1]:
-                    step = half + half * _looked_up(table, (size[1] - y) * scale_y + middle)
-                    share = one - (one - share) * step
-                found[p, b, n] = share
+                    _step_entries(y, -one, size[1], scale_y, last, index_y)
+                    _behind_edge(share, table, index_y, count)
+                _copy(share, found[p, b, first:end], count)
 
 
 @kernel
@@ -292,19 +326,26 @@ def cut_band(
 ) -> None:
     """One band of `stripe_bands.cut`, into the tables' [:, band]; `low` and `high` are of the panel in the image."""
     across = 0 if steep else 1
+    least, most = low[across], high[across] - 1
+    count = u.shape[1]
+    middle, along = np.empty(count, np.int64), np.empty(count, np.int64)
+    counts = np.empty(count, np.float32)
+    for n in range(count):
+        middle[n], along[n] = np.int64(np.rint(centre[band, n])), np.int64(u[band, n])
+        counts[n] = np.float32(1.0) if valid[band, n] else np.float32(0.0)
     for k in range(2 * reach + 1):
-        within = abs(k - reach) <= half
-        for n in range(u.shape[1]):
-            at = np.int64(np.rint(centre[band, n])) + k - reach
-            safe = min(max(at, low[across]), high[across] - 1)
-            along = np.int64(u[band, n])
-            row, column = (along, safe) if steep else (safe, along)
+        shift = k - reach
+        within = np.float32(1.0) if abs(shift) <= half else np.float32(0.0)
+        at_row, value_row, level_row, good_row = v[k, band], values[k, band], levels[k, band], good[k, band]
+        for n in range(count):
+            at = middle[n] + shift
+            safe = min(max(at, least), most)
+            row, column = (along[n], safe) if steep else (safe, along[n])
             value = image[np.uint64(row), np.uint64(column)]
-            v[k, band, n] = at
-            values[k, band, n] = value
-            levels[k, band, n] = bright[np.uint64(row - low[1]), np.uint64(column - low[0])]
-            counts = at == safe and value < limit and within and valid[band, n]
-            good[k, band, n] = np.float32(1.0) if counts else np.float32(0.0)
+            at_row[n] = at
+            value_row[n] = value
+            level_row[n] = bright[np.uint64(row - low[1]), np.uint64(column - low[0])]
+            good_row[n] = within * counts[n] if at == safe and value < limit else np.float32(0.0)
 
 
 @kernel
