@@ -10,6 +10,7 @@ from cyclopts import Parameter, validators
 from lidarpose.cli.options import Json
 
 if TYPE_CHECKING:
+    from lidarpose.geometry.arrays import FloatArray
     from lidarpose.measure.planes import MeasuredPlane
 
 
@@ -35,15 +36,19 @@ def measure_planes(
     never_stops
         The turntable turned on during the sweeps: interpolate its readings by time_s.npy.
     """
-    from lidarpose.cli.console import print_json
+    from lidarpose.cli.console import out, print_json
     from lidarpose.cli.measure_input import measurement_view
     from lidarpose.measure.planes import axis_angles_deg, plane_angles_deg
     from lidarpose.workflows.measuring import measure_planes as measure
+    from lidarpose.workflows.measuring import plane_angle_sigmas
 
     view = measurement_view(source, calibration, never_stops)
     planes = measure(view, least_share=least_share)
+    angles, sigmas = plane_angles_deg(planes), plane_angle_sigmas(view, planes)
     if not json:
-        _print(planes, view.frame)
+        _print(planes, angles, sigmas, view.frame)
+        for remark in view.remarks:
+            out().print(f"Note: {remark}", markup=False, soft_wrap=True)
         return
     entries = [
         {
@@ -56,23 +61,30 @@ def measure_planes(
         }
         for p in planes
     ]
-    print_json({"planes": entries, "angles_deg": plane_angles_deg(planes).tolist(), "frame": view.frame})
+    print_json(
+        {
+            "planes": entries,
+            "angles_deg": angles.tolist(),
+            "angles_sigma_deg": sigmas.tolist(),
+            "frame": view.frame,
+            "remarks": list(view.remarks),
+        }
+    )
 
 
-def _print(planes: list[MeasuredPlane], frame: str) -> None:
+def _print(planes: list[MeasuredPlane], angles: FloatArray, sigmas: FloatArray, frame: str) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     from lidarpose.cli.console import out
-    from lidarpose.measure.planes import axis_angles_deg, plane_angles_deg
+    from lidarpose.measure.planes import axis_angles_deg
 
-    angles = plane_angles_deg(planes)
     table = Table(box=SIMPLE_HEAD, title=f"Planes, normal . x = offset in the {frame} frame", title_justify="left")
-    for column in ("", "normal", "offset m", "points", "rms mm", "to x, y, z deg", "to the others deg"):
+    for column in ("", "normal", "offset m", "points", "rms mm", "to x, y, z deg", "to the others deg ± sigma"):
         table.add_column(column, justify="right")
     for k, p in enumerate(planes):
         normal = " ".join(f"{x:+.4f}" for x in p.plane.normal)
         axes = " ".join(f"{a:.1f}" for a in axis_angles_deg(p.plane))
-        others = " ".join("-" if k == j else f"{a:.2f}" for j, a in enumerate(angles[k]))
+        others = "  ".join("-" if k == j else f"{a:.2f}±{sigmas[k, j]:.2f}" for j, a in enumerate(angles[k]))
         table.add_row(str(k), normal, f"{p.plane.offset:.4f}", str(p.points), f"{1e3 * p.rms_m:.2f}", axes, others)
     out().print(table)

@@ -95,7 +95,7 @@ def scan(
         )
         return
     for remark in remarks:
-        out().print(f"Note: {remark}")
+        out().print(f"Note: {remark}", markup=False, soft_wrap=True)
     out().print(f"{points} points of {sweeps.range_m.size} beams in the {frame} frame: {output}")
 
 
@@ -109,7 +109,8 @@ def _check_gate(nearest_m: float, farthest_m: float) -> None:
 
 
 def _remarks(sigma: bool, calibration: TurntableCalibration, recording: SweepRecording) -> list[str]:
-    remarks = []
+    caution = None if calibration.quality is None else calibration.quality.caution
+    remarks = [] if caution is None else [caution]
     if sigma and calibration.motion_covariance is None:
         remarks.append("the calibration carries no covariance; sigma_m holds the range noise alone")
     if sigma and recording.lidar.range_sigma_m is None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.calibration import TurntableCalibration, WorldCalibration
 from lidarpose.model.recording import SweepRecording
@@ -58,6 +58,38 @@ def point_sigma(
         if world.covariance is not None:
             variance += moved_variance(world.covariance, world_points(points_camera, world))
     return np.asarray(np.sqrt(variance), dtype=np.float32)
+
+
+def point_shifts(
+    points: FloatArray, index: IntArray, recording: SweepRecording, calibration: TurntableCalibration
+) -> FloatArray:
+    """How points (n, 3) of flat indices (n,) move with the parameters of `shifting_covariance`: (n, 3, p).
+
+    `recording` and `calibration` are as in `point_sigma`.
+    """
+    sweep, beam = np.divmod(index, recording.beams)
+    angles = recording.turntable_angle_rad
+    angle = angles[sweep, beam] if recording.has_reading_per_beam else angles[sweep]
+    J = calibration.motion.in_true_angles.pose_jacobians(angle)
+    out = [J[:, :3] + np.cross(J[:, 3:], points[:, :, None], axis=1)]
+    for name in _MOVING:
+        if name in calibration.parameter_names:
+            by = np.empty((len(points), 3, 1))
+            for one in np.unique(sweep):
+                mine = sweep == one
+                theta, mean = recording.beam_angle_rad[beam[mine]], float(angle[mine].mean())
+                by[mine, :, 0] = _moved_by(name, calibration, theta, mean, points[mine])
+            out.append(by)
+    return np.concatenate(out, axis=2)
+
+
+def shifting_covariance(calibration: TurntableCalibration) -> FloatArray | None:
+    """Of the motion's ten parameters and those further ones that move points; None where there is none."""
+    if calibration.parameter_covariance is None:
+        return None
+    names = calibration.parameter_names
+    at = [*range(10), *(names.index(name) for name in _MOVING if name in names)]
+    return calibration.parameter_covariance[np.ix_(at, at)]
 
 
 _MOVING = ("encoder_scale", "range_offset_m", "range_scale", "beam_angle_scale")

@@ -24,6 +24,13 @@ class Quality:
     reasons: tuple[str, ...] = ()
     figures: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def caution(self) -> str | None:
+        """What whoever uses the result should know: the verdict and its first reason; None where it is good."""
+        if self.verdict == "good":
+            return None
+        return f"the calibration's verdict is {self.verdict}" + "".join(f": {reason}" for reason in self.reasons[:1])
+
 
 def uncertain_pose_at(
     motion: TurntableMotion, names: Sequence[str], covariance: FloatArray, turntable_angle_rad: float

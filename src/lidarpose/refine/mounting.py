@@ -12,7 +12,7 @@ from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.se3 import Pose, skew
 from lidarpose.model.beam_correction import BeamCorrection
 from lidarpose.model.calibration import TurntableCalibration
-from lidarpose.model.spun_scan import FlatReturns, FlatSurface, MountingEstimate
+from lidarpose.model.spun_scan import FlatReturns, FlatSurface, MountingEstimate, ReadingJump
 from lidarpose.model.turntable import PARAMETER_NAMES
 from lidarpose.model.turntable_result import ExtraParameter
 from lidarpose.refine.bent_surfaces import bend_of
@@ -28,7 +28,7 @@ from lidarpose.refine.flatness import (
     solve,
     start_state,
 )
-from lidarpose.refine.mounting_verdict import IN_WORDS, Findings, MountingOptions, quality_of
+from lidarpose.refine.mounting_verdict import IN_WORDS, Findings, MountingOptions, quality_of, slipped
 from lidarpose.refine.reading_jumps import reading_jumps
 from lidarpose.refine.sweep_turning import sweep_turning
 from lidarpose.refine.turntable_state import regular_motion
@@ -85,7 +85,8 @@ def refine_mounting(
         covariance = evidence.covariance(free)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise _undetermined("The flat surfaces seen leave the mounting open") from error
-    _refuse_undetermined(covariance, options.estimate)
+    jumps, from_steps = reading_jumps(solution, returns)
+    _refuse_undetermined(covariance, options.estimate, jumps)
     tested = _extras(solution, evidence, options.estimate, covariance)
     bend = bend_of(solution, returns, solution.line.by_all[:, free])
     by_noise = evidence.covariance(free, widened=False)
@@ -95,7 +96,6 @@ def refine_mounting(
     turning = None if any(extra.suggested for extra in tested) else sweep_turning(solution, returns, free)
     if turning is not None and (turning.contradicted or (turning.open and not options.sweeps_stated)):
         covariance = covariance + np.outer(turning.move, turning.move)
-    jumps, from_steps = reading_jumps(solution, returns)
     findings = Findings(
         solution,
         evidence,
@@ -144,7 +144,7 @@ def _undetermined(what: str) -> UndeterminedError:
     )
 
 
-def _refuse_undetermined(covariance: FloatArray, estimate: Sequence[str]) -> None:
+def _refuse_undetermined(covariance: FloatArray, estimate: Sequence[str], jumps: Sequence[ReadingJump]) -> None:
     sigma = np.sqrt(np.diag(covariance))
     if not np.all(np.isfinite(sigma)):
         raise _undetermined("The flat surfaces seen leave the mounting open")
@@ -158,10 +158,15 @@ def _refuse_undetermined(covariance: FloatArray, estimate: Sequence[str]) -> Non
             )
     tilt, shift = float(sigma[:2].max()), float(sigma[2:4].max())
     if tilt > LARGEST_TILT_SIGMA_RAD or shift > LARGEST_SHIFT_SIGMA_M:
-        raise _undetermined(
+        open_ = (
             f"The flat surfaces seen leave the mounting open: standard deviations {np.degrees(tilt):.2g} deg "
             f"and {1e3 * shift:.3g} mm"
         )
+        if jumps:
+            raise UndeterminedError(
+                f"{open_}; {slipped(jumps)}", remedy="Record again with readings that are where the table was."
+            )
+        raise _undetermined(open_)
 
 
 def _extras(

@@ -116,7 +116,7 @@ def _about_readings(found: Findings) -> Iterator[str]:
     if not found.solution.converged:
         yield "the estimate did not settle: the start may be too far off, or the scene not flat enough"
     if found.jumps:
-        yield _slipped(found.jumps)
+        yield slipped(found.jumps)
     if found.reading_scatter_rad > LARGEST_READING_SCATTER_RAD:
         yield (
             f"single sweeps' readings seem to be off by {np.degrees(found.reading_scatter_rad):.2f} deg or more: a "
@@ -202,9 +202,10 @@ def _figures(found: Findings) -> dict[str, Any]:
     }
 
 
-def _slipped(jumps: Sequence[ReadingJump]) -> str:
+def slipped(jumps: Sequence[ReadingJump]) -> str:
+    """In words, for one jump or more, the largest first."""
     worst = jumps[0]
-    more = f", and {len(jumps) - 1} times more" if len(jumps) > 1 else ""
+    more = {1: "", 2: ", and once more"}.get(len(jumps), f", and {len(jumps) - 1} times more")
     first, second = worst.sweeps
     seen, stated = np.degrees(worst.seen_rad), np.degrees(worst.stated_rad)
     return (

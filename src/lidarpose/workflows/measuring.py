@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,8 @@ from lidarpose.measure.box import with_calibration as box_with_calibration
 from lidarpose.measure.cloud_beams import beams_of_cells, beams_of_rings, recording_from_cloud
 from lidarpose.measure.disk import RoundMeasurement, measure_round, with_calibration
 from lidarpose.measure.outline import Kind, nothing_round
-from lidarpose.measure.planes import MeasuredPlane, joined_planes
+from lidarpose.measure.planes import MeasuredPlane, PointShifts, joined_planes, plane_angle_sigmas_deg
+from lidarpose.measure.point_sigma import point_shifts, shifting_covariance
 from lidarpose.model.beam_correction import BeamCorrection
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.cloud import Cloud
@@ -43,6 +44,8 @@ class MeasuringView:
         False if only the object's own points can be trusted: the cloud's viewpoint is not known.
     covariance, moved
         The calibration's covariance, and the beams of flat indices under a change of its parameters.
+    shifts, shift_covariance
+        How points of flat indices move with all of the calibration's parameters, and the covariance of these.
     remarks
         What a person should know of it.
     """
@@ -53,6 +56,8 @@ class MeasuringView:
     sees_behind: bool = True
     covariance: FloatArray | None = None
     moved: Callable[[FloatArray, IntArray], Beams] | None = None
+    shifts: PointShifts | None = None
+    shift_covariance: FloatArray | None = None
     remarks: tuple[str, ...] = ()
 
 
@@ -65,17 +70,31 @@ def view_of_recording(recording: SweepRecording, calibration: TurntableCalibrati
         If there are too few returns.
     """
     recording = in_true_angles(recording, calibration)
+    as_in_file = calibration
     calibration = replace(calibration, motion=calibration.motion.in_true_angles)
 
     def moved(change: FloatArray, index: IntArray) -> Beams:
         return chosen_beams(recording, calibration.motion, index, change)
 
     beams = beams_of(recording, calibration.motion)
-    remarks: tuple[str, ...] = ()
+    caution = None if calibration.quality is None else calibration.quality.caution
+    remarks: tuple[str, ...] = () if caution is None else (caution,)
     if calibration.motion_covariance is None:
-        remarks = ("the calibration carries no covariance: its share of sigma_mm is not known and not included",)
+        remarks += (
+            "the calibration carries no covariance: its share of standard deviations is not known and left out",
+        )
     noise = _noise(beams, recording.lidar.range_sigma_m)
-    return MeasuringView(beams, noise, "camera", True, calibration.motion_covariance, moved, remarks)
+    return MeasuringView(
+        beams,
+        noise,
+        "camera",
+        True,
+        calibration.motion_covariance,
+        moved,
+        lambda index: point_shifts(beams.points.reshape(-1, 3)[index], index, recording, as_in_file),
+        shifting_covariance(as_in_file),
+        remarks,
+    )
 
 
 def view_of_cloud(cloud: Cloud, calibration: TurntableCalibration | None) -> MeasuringView:
@@ -158,14 +177,20 @@ def measure_planes(view: MeasuringView, *, least_share: float = 0.002, seed: int
         If nothing flat is found.
     """
     points = view.beams.points.reshape(-1, 3)
-    points = points[np.isfinite(points[:, 0])]
-    patches = segment_planes(points, PlaneSearch(min_points=60, min_share=least_share, seed=seed, bent=True))
-    planes = joined_planes([points[p.indices] for p in patches], view.noise_m)
+    seen = np.flatnonzero(np.isfinite(points[:, 0]))
+    patches = segment_planes(points[seen], PlaneSearch(min_points=60, min_share=least_share, seed=seed, bent=True))
+    planes = joined_planes(points, [seen[p.indices] for p in patches], view.noise_m)
     if not planes:
         raise UndeterminedError(
             "Nothing flat was found", remedy="A plane must hold at least 60 points and a five hundredth of all."
         )
     return planes
+
+
+def plane_angle_sigmas(view: MeasuringView, planes: Sequence[MeasuredPlane]) -> FloatArray:
+    """Standard deviations (n, n) in degrees of the angles between measured planes, the calibration's share included."""
+    points = view.beams.points.reshape(-1, 3)
+    return plane_angle_sigmas_deg(planes, points, view.shifts, view.shift_covariance)
 
 
 def with_readings_between(recording: SweepRecording) -> SweepRecording:
