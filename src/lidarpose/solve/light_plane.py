@@ -142,41 +142,90 @@ def fit_light_plane(stripes: Sequence[StripeOnPanel], *, seed: int = 0) -> Light
 
 def fit_light_planes(places: Sequence[Sequence[StripeOnPanel]], *, seed: int = 0) -> list[LightPlane | ValueError]:
     """The same for the stripes of many places at once, in a fraction of the time; or why a place has none."""
-    starts: dict[int, Plane] = {}
-    found: dict[int, LightPlane | ValueError] = {}
-    for k, stripes in enumerate(places):
-        try:
-            starts[k] = _start(stripes, seed)
-        except ValueError as reason:
-            found[k] = reason
-    if starts:
-        found.update(zip(starts, _settled([places[k] for k in starts], list(starts.values())), strict=True))
+    if not places:
+        return []
+    table = _Table.of(places)
+    normal, offset, problems = _starts(places, table, seed)
+    found: dict[int, LightPlane | ValueError] = dict(problems)
+    start = np.array([k for k in range(len(places)) if k not in problems], dtype=np.intp)
+    if len(start):
+        settled = _settled(table.take(start), normal[start], offset[start], [places[k] for k in start])
+        found.update(zip(start.tolist(), settled, strict=True))
     return [found[k] for k in range(len(places))]
 
 
-def _settled(places: Sequence[Sequence[StripeOnPanel]], starts: Sequence[Plane]) -> list[LightPlane | ValueError]:
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """Points (P, N, 3) of all stripes of each place, one after the other, how far they move for a standard deviation
+    of their pixel (P, N, 3), the least that counts of that (P, N), and where there are any (P, N)."""
+
+    points: FloatArray
+    spread: FloatArray
+    floor: FloatArray
+    there: BoolArray
+
+    @staticmethod
+    def of(places: Sequence[Sequence[StripeOnPanel]]) -> _Table:
+        points, there = _padded([[s.points_camera for s in stripes] for stripes in places])
+        spread, _ = _padded([[s.spread_camera for s in stripes] for stripes in places])
+        # A point whose pixel moves it along the plane would weigh without bound.
+        return _Table(points, spread, np.maximum(0.05 * np.linalg.norm(spread, axis=2), 1e-12), there)
+
+    def take(self, which: IntArray) -> _Table:
+        if len(which) == len(self.points):
+            return self
+        return _Table(self.points[which], self.spread[which], self.floor[which], self.there[which])
+
+    def sigma(self, normal: FloatArray) -> FloatArray:
+        """Standard deviations (P, N) of the points across planes with these normals (P, 3)."""
+        return np.asarray(np.maximum(np.abs(_along(self.spread, normal)), self.floor))
+
+
+def _starts(
+    places: Sequence[Sequence[StripeOnPanel]], table: _Table, seed: int
+) -> tuple[FloatArray, FloatArray, dict[int, ValueError]]:
+    """Normals (P, 3) and offsets (P,): the plain fit where nothing contradicts it, else the plane of least median; and
+    by place why there is none."""
+    normal, offset = _weighted_planes(table.points, table.there.astype(np.float64))
+    with np.errstate(invalid="ignore"):
+        near = np.abs(_along(table.points, normal) - offset[:, None]) < 4.0 * table.sigma(normal)
+    few = np.count_nonzero(table.there, axis=1) < 4
+    problems = {
+        k: ValueError("a light plane needs at least four points of its stripes") for k in np.flatnonzero(few).tolist()
+    }
+    for k in np.flatnonzero(~few & ~(near | ~table.there).all(axis=1)).tolist():
+        groups: IntArray = np.repeat(np.arange(len(places[k])), [len(s.points_camera) for s in places[k]])
+        there = table.there[k]
+        try:
+            plane = _least_median_plane(table.points[k, there], table.spread[k, there], groups, seed)
+        except ValueError as reason:
+            problems[k] = reason
+        else:
+            normal[k], offset[k] = plane.normal, plane.offset
+    return normal, offset, problems
+
+
+def _settled(
+    table: _Table, normal: FloatArray, offset: FloatArray, places: Sequence[Sequence[StripeOnPanel]]
+) -> list[LightPlane | ValueError]:
     """Light planes from their starts, by steps that each takes until it has settled: twenty at most."""
-    points, there = _padded([[s.points_camera for s in stripes] for stripes in places])
-    spread, _ = _padded([[s.spread_camera for s in stripes] for stripes in places])
-    floor = np.maximum(0.05 * np.linalg.norm(spread, axis=2), 1e-12)
-    normal, offset = np.array([p.normal for p in starts]), np.array([p.offset for p in starts])
-    weight = there.astype(np.float64)
+    points = table.points
+    weight = table.there.astype(np.float64)
     active = np.arange(len(places))
     for _ in range(20):
-        n, x, here = normal[active], points[active], there[active]
-        # A point whose pixel moves it along the plane would weigh without bound.
-        sigma = np.maximum(np.abs(_along(spread[active], n)), floor[active])
+        part, n = table.take(active), normal[active]
+        x = part.points
+        sigma = part.sigma(n)
         standardised = (_along(x, n) - offset[active, None]) / sigma
-        scale = MAD_TO_SIGMA * row_medians(np.abs(standardised), here)
-        weight[active] = tukey_weights(standardised / np.maximum(scale, 1.0)[:, None]) * here
+        scale = MAD_TO_SIGMA * row_medians(np.abs(standardised), part.there)
+        weight[active] = tukey_weights(standardised / np.maximum(scale, 1.0)[:, None]) * part.there
         normal[active], offset[active] = _weighted_planes(x, weight[active] / sigma**2)
         turned = np.cross(normal[active], n)
         # A hundredth of what the best stripes can tell. (A plane that is lost, NaN, has nothing to settle.)
         active = active[(turned * turned).sum(axis=1) >= SETTLED_RAD**2]
         if len(active) == 0:
             break
-    sigma = np.maximum(np.abs(_along(spread, normal)), floor)
-    return _with_covariance(normal, offset, points, weight, weight / sigma**2, places)
+    return _with_covariance(normal, offset, points, weight, weight / table.sigma(normal) ** 2, places)
 
 
 def _padded(places: Sequence[Sequence[FloatArray]]) -> tuple[FloatArray, BoolArray]:
@@ -233,29 +282,6 @@ def stripe_pair(
     return StripePair(
         light, E, np.array(directions), float(angle_between(directions[0], directions[1])), np.array(extents)
     )
-
-
-def _sigma_across(plane: Plane, points: FloatArray, spread: FloatArray) -> FloatArray:
-    sigma = np.abs(spread @ plane.normal)
-    # A point whose pixel moves it along the plane would weigh without bound.
-    floor = 0.05 * np.linalg.norm(spread, axis=1)
-    return np.asarray(np.maximum(np.maximum(sigma, floor), 1e-12))
-
-
-def _start(stripes: Sequence[StripeOnPanel], seed: int) -> Plane:
-    """The plain fit if nothing contradicts it, else the plane of least median. Raises ValueError if there is none."""
-    points = np.concatenate([s.points_camera for s in stripes])
-    if len(points) < 4:
-        raise ValueError("a light plane needs at least four points of its stripes")
-    spread = np.concatenate([s.spread_camera for s in stripes])
-    try:
-        plane = fit_plane(points)
-        if np.all(np.abs(plane.distance(points)) < 4.0 * _sigma_across(plane, points, spread)):
-            return plane
-    except ValueError:
-        pass
-    groups: IntArray = np.repeat(np.arange(len(stripes)), [len(s.points_camera) for s in stripes])
-    return _least_median_plane(points, spread, groups, seed)
 
 
 def _least_median_plane(points: FloatArray, spread: FloatArray, groups: IntArray, seed: int) -> Plane:

@@ -19,7 +19,7 @@ from lidarpose.geometry.arrays import BoolArray, FloatArray, angle_between, perp
 from lidarpose.geometry.circles import fit_circle3
 from lidarpose.geometry.planes import fit_plane
 from lidarpose.geometry.robust import tukey_weights
-from lidarpose.geometry.se3 import Pose, exp_so3, log_so3, nearest_rotation, rotation_z, skew
+from lidarpose.geometry.se3 import Pose, exp_se3, exp_so3, log_so3, nearest_rotation, rotation_z, skew
 from lidarpose.model.turntable import TurntableMotion
 
 # Readings closer than this are one and the same place (a thousandth of a degree).
@@ -134,10 +134,12 @@ def fit_by_readings(
     R = np.stack([p.rotation for p in poses])
     t = np.stack([p.translation for p in poses])
     if start is None:
-        T_w, T_m = _start_from_pairs(angles, R, t)
+        factors = _start_from_pairs(angles, R, t)
     else:
         T_w, T_m = start.T_camera_turntable, start.T_turntable_lidar
-    information = _information(poses, covariances, _residuals(angles, R, t, T_w, T_m))
+        factors = np.stack([T_w.rotation, T_m.rotation]), np.stack([T_w.translation, T_m.translation])
+    residuals = _residuals(angles, R, t, factors)
+    information = _information(poses, covariances, residuals)
     floor = LEAST_SCALE if covariances is None else 1.0
     weight: FloatArray = np.ones(len(angles))
     scaled = information
@@ -145,11 +147,17 @@ def fit_by_readings(
         previous = weight
         # Lenient at first: the start rests on two places, and the others lie off it by more than their noise.
         lenience = max(1.0, 16.0 / 2.0**k)
-        scaled, weight = _reweigh(_residuals(angles, R, t, T_w, T_m), information, floor, lenience)
-        T_w, T_m = _fit_motion(angles, R, t, scaled * weight[:, None, None], T_w, T_m, steps=1)
+        scaled, weight = _reweigh(residuals, information, floor, lenience)
+        factors, _ = _step(angles, residuals, scaled * weight[:, None, None], factors)
+        residuals = _residuals(angles, R, t, factors)
         if lenience == 1.0 and np.abs(weight - previous).max() < 1e-3:
             break
-    T_w, T_m = _fit_motion(angles, R, t, scaled * weight[:, None, None], T_w, T_m, steps=10)
+    for _ in range(10):
+        factors, length = _step(angles, residuals, scaled * weight[:, None, None], factors)
+        if length < 1e-12:
+            break
+        residuals = _residuals(angles, R, t, factors)
+    T_w, T_m = (Pose(rotation, shift) for rotation, shift in zip(nearest_rotation(factors[0]), factors[1], strict=True))
     motion = TurntableMotion.from_any_frame(T_w, T_m)
     return TurntableFunction(motion, np.asarray(weight > 0.0), deviations(motion, list(angles), poses))
 
@@ -199,13 +207,18 @@ def require_readings(angles: FloatArray) -> None:
 # --- by the readings ---------------------------------------------------------------------------------------------
 
 
-def _start_from_pairs(angles: FloatArray, R: FloatArray, t: FloatArray) -> tuple[Pose, Pose]:
+_Factors = tuple[FloatArray, FloatArray]
+"""Rotations (2, 3, 3) and translations (2, 3) of T_w and T_m, in ``T_w @ Rz(reading) @ T_m``."""
+
+
+def _start_from_pairs(angles: FloatArray, R: FloatArray, t: FloatArray) -> _Factors:
     """The motion of the pair of places that most places agree with (least median)."""
     pairs = np.array(wide_pairs(angles))
     motions = motions_of_pairs(angles[pairs], R[pairs], t[pairs])
     e = motions.residuals(angles, R, t)
     # A radian counts as a metre: scores are only compared among the pairs of one session.
-    return motions.one(int(np.argmin(np.median((e * e).sum(axis=2), axis=1))))
+    best = int(np.argmin(np.median((e * e).sum(axis=2), axis=1)))
+    return np.stack([motions.R_w[best], motions.R_m[best]]), np.stack([motions.t_w[best], motions.t_m[best]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,11 +286,12 @@ def wide_pairs(angles: FloatArray, most: int = PAIRS) -> list[tuple[int, int]]:
     return [(int(i[k]), int(j[k])) for k in chosen]
 
 
-def _residuals(angles: FloatArray, R: FloatArray, t: FloatArray, T_w: Pose, T_m: Pose) -> FloatArray:
+def _residuals(angles: FloatArray, R: FloatArray, t: FloatArray, factors: _Factors) -> FloatArray:
     """Residuals (N, 6) of poses in the LiDAR's own frame: translation, rotation."""
-    turned = T_w.rotation @ rotation_z(angles)
-    back = np.swapaxes(turned @ T_m.rotation, -1, -2)
-    shift = t - (turned @ T_m.translation + T_w.translation)
+    (R_w, R_m), (t_w, t_m) = factors
+    turned = R_w @ rotation_z(angles)
+    back = np.swapaxes(turned @ R_m, -1, -2)
+    shift = t - (turned @ t_m + t_w)
     return np.concatenate([(back @ shift[..., None])[..., 0], log_so3(back @ R)], axis=1)
 
 
@@ -318,39 +332,34 @@ def _reweigh(
     return scaled, tukey_weights(np.sqrt(squares / 6.0) / lenience, 3.5)
 
 
-def _fit_motion(
-    angles: FloatArray, R: FloatArray, t: FloatArray, information: FloatArray, T_w: Pose, T_m: Pose, *, steps: int
-) -> tuple[Pose, Pose]:
-    """Weighted least squares of T_i = T_w @ Rz(angle_i) @ T_m by Gauss-Newton on left perturbations of both factors."""
-    for _ in range(steps):
-        e = _residuals(angles, R, t, T_w, T_m)
-        J = _motion_jacobian(angles, T_w, T_m)
-        weighted = np.swapaxes(J, -1, -2) @ information
-        H, g = (weighted @ J).sum(axis=0), (weighted @ e[..., None]).sum(axis=0)[:, 0]
-        # The turn about z and the shift along it may be put into either factor: the smallest step leaves it alone.
-        root = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
-        step = root * np.linalg.lstsq(H * np.outer(root, root), g * root, rcond=1e-11)[0]
-        T_w, T_m = _stepped(T_w, step[:6]), _stepped(T_m, step[6:])
-        if np.abs(step).max() < 1e-12:
-            break
-    return T_w, T_m
+def _step(
+    angles: FloatArray, residuals: FloatArray, information: FloatArray, factors: _Factors
+) -> tuple[_Factors, float]:
+    """A step of weighted least squares of T_i = T_w @ Rz(angle_i) @ T_m, by Gauss and Newton on left perturbations of
+    both factors; and its length."""
+    J = _motion_jacobian(angles, factors)
+    weighted = (information @ J).reshape(-1, 12).T
+    H, g = weighted @ J.reshape(-1, 12), weighted @ residuals.ravel()
+    # The turn about z and the shift along it may be put into either factor: the smallest step leaves it alone.
+    root = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+    step = root * np.linalg.lstsq(H * np.outer(root, root), g * root, rcond=1e-11)[0]
+    R, t = exp_se3(step.reshape(2, 6))
+    rotation, translation = factors
+    return (R @ rotation, (R @ translation[..., None])[..., 0] + t), float(np.abs(step).max())
 
 
-def _motion_jacobian(angles: FloatArray, T_w: Pose, T_m: Pose) -> FloatArray:
+def _motion_jacobian(angles: FloatArray, factors: _Factors) -> FloatArray:
     """Derivative (N, 6, 12) of each modelled pose, in the LiDAR's own frame, by left perturbations of both factors."""
-    turned = T_w.rotation @ rotation_z(angles)
-    back = np.swapaxes(turned @ T_m.rotation, -1, -2)
-    places = turned @ T_m.translation + T_w.translation
+    (R_w, R_m), (t_w, t_m) = factors
+    turned = R_w @ rotation_z(angles)
+    back = np.swapaxes(turned @ R_m, -1, -2)
+    places = turned @ t_m + t_w
     J = np.zeros((len(angles), 6, 12))
     J[:, :3, :3] = J[:, 3:, 3:6] = back
     J[:, :3, 3:6] = -back @ skew(places)
-    J[:, :, 6:] = T_m.inverse().adjoint()
+    J[:, :3, 6:9] = J[:, 3:, 9:] = R_m.T
+    J[:, :3, 9:] = -R_m.T @ skew(t_m)
     return J
-
-
-def _stepped(pose: Pose, step: FloatArray) -> Pose:
-    moved = Pose.exp(step) @ pose
-    return Pose(nearest_rotation(moved.rotation), moved.translation)
 
 
 def _frame_about(axis: FloatArray, origin: FloatArray) -> Pose:
