@@ -6,7 +6,8 @@ from benchmarks.suites.plane_search import scene
 
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.geometry import compiled
-from lidarpose.geometry.arrays import FloatArray, angle_between
+from lidarpose.geometry.arrays import FloatArray, angle_between, perpendicular_pair
+from lidarpose.geometry.planes import Plane
 from lidarpose.model.plane_patch import PlanePatch
 
 pytestmark = pytest.mark.skipif(not compiled.installed(), reason="numba is not installed")
@@ -40,6 +41,46 @@ def assert_the_same(ways: list[tuple[PlanePatch, ...]]) -> None:
 def assert_apart(patches: tuple[PlanePatch, ...]) -> None:
     every = np.concatenate([patch.indices for patch in patches])
     assert len(np.unique(every)) == len(every)
+
+
+def test_patches_of_a_cloud_that_is_searched_whole_are_the_same() -> None:
+    """And those that come up once the large ones are gone, from several subsamples, down to the clutter's."""
+    points, _ = scene(20_000, 0.02, 1)
+    assert_the_same(both_ways(points, PlaneSearch(from_sensor=True)))
+
+
+def test_eigenvalues_and_vectors_of_small_matrices() -> None:
+    from lidarpose.detect.patch_kernels import eigen
+
+    rng = np.random.default_rng(3)
+    for scale in ([1.0, 1.0, 1.0], [1e-6, 1.0, 2.0], [0.0, 1e-12, 1.0], [0.0, 0.0, 0.0], [3.0, 3.0, 7.0]):
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        matrix = turn @ np.diag(scale) @ turn.T
+        matrix = 0.5 * (matrix + matrix.T)
+        values, vectors = eigen(matrix)
+        np.testing.assert_allclose(values, np.linalg.eigvalsh(matrix), atol=1e-15)
+        np.testing.assert_allclose(vectors @ np.diag(values) @ vectors.T, matrix, atol=2e-15)
+        np.testing.assert_allclose(vectors.T @ vectors, np.eye(3), atol=1e-15)
+
+
+def test_the_largest_piece_is_the_same() -> None:
+    """Crumbs of points on a plane, among them pieces of the same size, of which the first one counts."""
+    from lidarpose.detect.cloud_planes import _largest_component
+
+    plane = Plane(np.array([0.3, -0.2, 1.0]), 1.0)
+    across = np.stack(perpendicular_pair(plane.normal))
+    rng = np.random.default_rng(4)
+    for crumbs in (1, 2, 5, 40):
+        middle = rng.uniform(-2.0, 2.0, (crumbs, 2))
+        flat = np.concatenate([m + rng.uniform(-0.1, 0.1, (12, 2)) for m in middle])
+        points = (flat @ across + plane.offset * plane.normal).astype(np.float32)
+        inside = rng.random(len(points)) < 0.9
+        pieces = []
+        for way in (False, True):
+            with compiled.forced(way):
+                pieces.append(_largest_component(points, inside, plane))
+        assert 0 < np.count_nonzero(pieces[0]) <= np.count_nonzero(inside)
+        np.testing.assert_array_equal(pieces[0], pieces[1])
 
 
 @pytest.mark.parametrize("small", [None, 0.02])

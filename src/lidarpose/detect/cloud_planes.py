@@ -17,8 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarpose.detect.plane_claims import Slab, patches_of_slabs
-from lidarpose.detect.plane_raster import cell_size_m, grown, mean_and_covariance, raster_of
-from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
+from lidarpose.detect.plane_raster import (
+    GAP_PER_RANGE,
+    MIN_GAP_M,
+    MOST_CELLS,
+    PlaneRaster,
+    cell_size_m,
+    grown,
+    mean_and_covariance,
+    raster_of,
+)
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, perpendicular_pair
+from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.planes import Plane
 from lidarpose.geometry.robust import mad_sigma
 from lidarpose.model.plane_patch import PlanePatch
@@ -26,6 +36,10 @@ from lidarpose.model.plane_patch import PlanePatch
 Float32Array = NDArray[np.float32]
 Bits = NDArray[np.uint64]
 
+KERNELS = "detect.patch_kernels"
+# By how much they search a cloud sooner: its subsamples, and all points where a cloud is searched whole.
+SAVED_S = 3e-3
+SAVED_S_PER_POINT = 1e-7
 SAMPLE_SIZE = 4096
 PLANES_AT_ONCE = 16
 # From this many points on, patches are found and tested in a subsample, and the whole cloud is asked once.
@@ -157,6 +171,8 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
     patches: list[PlanePatch] = []
     sigma_m: float | None = None
     settled = not search.bent
+    # What follows asks again, for nothing more.
+    pays(SAVED_S + SAVED_S_PER_POINT * (len(x) if len(x) <= DENSE else 0), KERNELS)
     for _ in range(search.max_rounds):
         at_most = search.max_planes - len(patches)
         count = int(np.count_nonzero(free))
@@ -363,6 +379,11 @@ class _Neighbourhoods:
 
 def _local_planes(chosen: Float32Array) -> tuple[FloatArray, FloatArray]:
     """Planes (H, 4) through neighbourhoods (H, K, 3), and the variances (H, 3) of their points, ascending."""
+    if pays(0.0, KERNELS):
+        from lidarpose.detect.patch_kernels import local_planes
+
+        planes, variances = local_planes(chosen)
+        return planes, variances
     mean = chosen.mean(axis=1, dtype=np.float64)
     d = chosen - mean[:, None, :]
     values, vectors = np.linalg.eigh(d.swapaxes(1, 2) @ d / chosen.shape[1])
@@ -457,6 +478,11 @@ def _moment_plane(points: NDArray[np.floating]) -> Plane:
 
 def _largest_component(points: Float32Array, inside: BoolArray, plane: Plane) -> BoolArray:
     """Of the points `inside` (S,), those of the largest piece that hangs together across gaps, on the plane."""
+    if pays(0.0, KERNELS):
+        from lidarpose.detect.patch_kernels import largest_piece
+
+        axes = np.stack(perpendicular_pair(plane.normal))
+        return np.asarray(largest_piece(points, inside, axes, MIN_GAP_M, GAP_PER_RANGE, MOST_CELLS))
     from scipy import ndimage
 
     members = np.flatnonzero(inside)
@@ -486,22 +512,18 @@ def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, comp
     allowed = np.append(grown(occupied[:-1].reshape(raster.shape)).ravel(), False)
     # Twice the widest slab: what lies just outside it tells a plane from something else.
     reach = np.float32(2.0 * WIDEST * GATE_SIGMAS * sample.sigma_m)
-    distance = x @ plane.normal.astype(np.float32) - np.float32(plane.offset)
-    near = np.flatnonzero((np.abs(distance) < reach) & free)
-    local = x[near]
-    keep = allowed[raster.cells(local)]
-    near, local = near[keep], local[keep]
+    centre = seen.mean(axis=0, dtype=np.float64)
+    near, local = _points_near(x, free, plane, reach, raster, allowed, centre.astype(np.float32))
     if len(near) < 6:
         return None
-    centre = seen.mean(axis=0, dtype=np.float64)
-    local = local - centre.astype(np.float32)
     sigma_m, normal, offset = sample.sigma_m, plane.normal, plane.offset - float(plane.normal @ centre)
+    moments = _moments_compiled if pays(0.0, KERNELS) else _moments
     for _ in range(3):
         distance = local @ normal.astype(np.float32) - np.float32(offset)
-        inside = np.abs(distance) < GATE_SIGMAS * sigma_m
+        inside = np.abs(distance) < np.float32(GATE_SIGMAS * sigma_m)
         if np.count_nonzero(inside) < 6:
             return None
-        normal, offset, variances = _moments(local, inside)
+        normal, offset, variances = moments(local, inside)
         sigma_m = _spread(distance[inside], sample.sigma_m)
     agree = None
     if sample.seeds is not None:
@@ -513,6 +535,30 @@ def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, comp
     offset += float(normal @ centre)
     final = Plane(normal, offset) if offset <= 0.0 else Plane(-normal, -offset)
     return PlanePatch(final, near[inside], sigma_m)
+
+
+def _points_near(
+    x: Float32Array,
+    free: BoolArray,
+    plane: Plane,
+    reach_m: np.float32,
+    raster: PlaneRaster,
+    allowed: BoolArray,
+    centre: Float32Array,
+) -> tuple[IntArray, Float32Array]:
+    """Which free points (M,) of x (N, 3) lie within reach of the plane in allowed cells, and where, from the centre."""
+    normal, offset = plane.normal.astype(np.float32), np.float32(plane.offset)
+    if pays(0.0, KERNELS):
+        from lidarpose.detect.patch_kernels import points_near
+
+        across = (raster.axes / raster.cell_m).astype(np.float32)
+        cells = allowed[:-1].reshape(raster.shape)
+        near, local = points_near(x, free, normal, offset, reach_m, across, raster.origin, cells, centre)
+        return near, local
+    near = np.flatnonzero((np.abs(x @ normal - offset) < reach_m) & free)
+    local = x[near]
+    keep = allowed[raster.cells(local)]
+    return near[keep], local[keep] - centre
 
 
 def _stands_out(
@@ -586,6 +632,15 @@ def _moments(local: Float32Array, inside: BoolArray) -> tuple[FloatArray, float,
     second = ((local * weight[:, None]).T @ local).astype(np.float64) / count - np.outer(mean, mean)
     variances, axes = np.linalg.eigh(second)
     return axes[:, 0], float(axes[:, 0] @ mean), variances
+
+
+def _moments_compiled(local: Float32Array, inside: BoolArray) -> tuple[FloatArray, float, FloatArray]:
+    """`_moments` by kernels."""
+    from lidarpose.detect.patch_kernels import eigen, moments
+
+    mean, second = moments(local, inside.view(np.uint8))
+    variances, axes = eigen(second)
+    return axes[:, 0].copy(), float(axes[:, 0] @ mean), variances
 
 
 def _spread(distance: Float32Array, first_sigma_m: float) -> float:

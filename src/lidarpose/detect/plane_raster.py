@@ -15,6 +15,8 @@ from lidarpose.geometry.robust import median
 # A patch is connected across gaps of this share of its range, which spans the lines of a 16-beam LiDAR on a slope.
 GAP_PER_RANGE = 0.06
 MIN_GAP_M = 0.04
+# Of a raster, each way; what lies beyond is no part of it.
+MOST_CELLS = 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,7 @@ def raster_of(points: NDArray[np.floating], plane: Plane, cell_m: float, border:
     axes = np.stack(perpendicular_pair(plane.normal))
     along = _along(points, axes, cell_m)
     low, high = along.min(axis=1) - border, along.max(axis=1) + border + 1
-    shape = np.minimum(high - low, 4000)
+    shape = np.minimum(high - low, MOST_CELLS)
     raster = PlaneRaster(axes, cell_m, low, (int(shape[0]), int(shape[1])))
     return raster, raster._numbers(along)
 

@@ -1,0 +1,222 @@
+"""The small steps of `detect.cloud_planes` over a subsample, compiled by numba; imported only where they pay.
+
+Each is the NumPy way's; sums are taken in double precision in place of single.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lidarpose.geometry.compiled import kernel, summing_kernel
+
+
+@kernel
+def eigen(matrix: Any) -> Any:
+    """Eigenvalues (3,), ascending, of a symmetric matrix (3, 3), and their vectors in columns: Jacobi's rotations."""
+    a, v = matrix.copy(), np.eye(3)
+    for _ in range(30):
+        off = a[0, 1] ** 2 + a[0, 2] ** 2 + a[1, 2] ** 2
+        if not off > 1e-36 * (a[0, 0] ** 2 + a[1, 1] ** 2 + a[2, 2] ** 2):
+            break
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if a[p, q] == 0.0:
+                    continue
+                theta = 0.5 * (a[q, q] - a[p, p]) / a[p, q]
+                t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
+                t = t if theta >= 0.0 else -t
+                c = 1.0 / np.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(3):
+                    a[k, p], a[k, q] = c * a[k, p] - s * a[k, q], s * a[k, p] + c * a[k, q]
+                for k in range(3):
+                    a[p, k], a[q, k] = c * a[p, k] - s * a[q, k], s * a[p, k] + c * a[q, k]
+                    v[k, p], v[k, q] = c * v[k, p] - s * v[k, q], s * v[k, p] + c * v[k, q]
+    for p, q in ((0, 1), (1, 2), (0, 1)):
+        if a[q, q] < a[p, p]:
+            a[p, p], a[q, q] = a[q, q], a[p, p]
+            for k in range(3):
+                v[k, p], v[k, q] = v[k, q], v[k, p]
+    return np.array([a[0, 0], a[1, 1], a[2, 2]]), v
+
+
+@kernel
+def local_planes(chosen: Any) -> Any:
+    """Planes (H, 4) through neighbourhoods (H, K, 3), and the variances (H, 3) of their points, ascending."""
+    hypotheses, count = chosen.shape[0], chosen.shape[1]
+    planes, variances = np.empty((hypotheses, 4)), np.empty((hypotheses, 3))
+    mean, second = np.empty(3), np.empty((3, 3))
+    for h in range(hypotheses):
+        mean[:] = 0.0
+        for j in range(count):
+            for i in range(3):
+                mean[i] += chosen[h, j, i]
+        mean /= count
+        second[:] = 0.0
+        for j in range(count):
+            p, q, r = chosen[h, j, 0] - mean[0], chosen[h, j, 1] - mean[1], chosen[h, j, 2] - mean[2]
+            second[0, 0] += p * p
+            second[0, 1] += p * q
+            second[0, 2] += p * r
+            second[1, 1] += q * q
+            second[1, 2] += q * r
+            second[2, 2] += r * r
+        second[1, 0], second[2, 0], second[2, 1] = second[0, 1], second[0, 2], second[1, 2]
+        values, vectors = eigen(second / count)
+        planes[h, :3] = vectors[:, 0]
+        planes[h, 3] = vectors[0, 0] * mean[0] + vectors[1, 0] * mean[1] + vectors[2, 0] * mean[2]
+        variances[h] = np.maximum(values, 0.0)
+    return planes, variances
+
+
+@kernel
+def _spacing(points: Any, members: Any) -> float:
+    """`plane_raster.spacing_m` of the points at the positions `members`."""
+    n = len(members)
+    if n < 4:
+        return 0.0
+    mean, second = np.zeros(3), np.zeros((3, 3))
+    for j in members:
+        for i in range(3):
+            mean[i] += points[j, i]
+    mean /= n
+    for j in members:
+        p, q, r = points[j, 0] - mean[0], points[j, 1] - mean[1], points[j, 2] - mean[2]
+        second[0, 0] += p * p
+        second[0, 1] += p * q
+        second[0, 2] += p * r
+        second[1, 1] += q * q
+        second[1, 2] += q * r
+        second[2, 2] += r * r
+    second[1, 0], second[2, 0], second[2, 1] = second[0, 1], second[0, 2], second[1, 2]
+    variances = np.maximum(eigen(second / (n - 1))[0], 0.0)
+    return float(2.0 * (144.0 * variances[1] * variances[2]) ** 0.25 / np.sqrt(n))
+
+
+@kernel
+def cell_size(points: Any, members: Any, least_gap: float, gap_per_range: float) -> float:
+    """`plane_raster.cell_size_m` of the points (S, 3) at the positions `members` (M,)."""
+    ranges = np.empty(len(members), np.float32)
+    for k in range(len(members)):
+        p, q, r = points[members[k], 0], points[members[k], 1], points[members[k], 2]
+        ranges[k] = np.sqrt(p * p + q * q + r * r)
+    gap = max(least_gap, gap_per_range * float(np.median(ranges)))
+    return max(gap, _spacing(points, members))
+
+
+@kernel
+def largest_piece(points: Any, inside: Any, axes: Any, least_gap: float, gap_per_range: float, most_cells: int) -> Any:
+    """Of the points (S, 3) that are `inside` (S,), those (S,) of the largest piece that hangs together on the plane
+    with the axes (2, 3)."""
+    members = np.flatnonzero(inside)
+    result = np.zeros(len(points), np.bool_)
+    n = len(members)
+    if n == 0:
+        return result
+    cell_m = cell_size(points, members, least_gap, gap_per_range)
+    across = (axes / cell_m).astype(np.float32)
+    along = np.empty((n, 2), np.int64)
+    for k in range(n):
+        x, y, z = points[members[k], 0], points[members[k], 1], points[members[k], 2]
+        for i in range(2):
+            along[k, i] = np.int64(np.floor(across[i, 0] * x + across[i, 1] * y + across[i, 2] * z))
+    low_u, low_v = along[:, 0].min(), along[:, 1].min()
+    height = min(along[:, 0].max() - low_u + 1, most_cells)
+    width = min(along[:, 1].max() - low_v + 1, most_cells)
+    # A frame of empty cells, so that each has eight neighbours.
+    line = width + 2
+    count = np.zeros((height + 2) * line, np.int32)
+    cells = np.empty(n, np.int64)
+    for k in range(n):
+        u, v = along[k, 0] - low_u, along[k, 1] - low_v
+        cells[k] = (u + 1) * line + v + 1 if u < height and v < width else 0
+        if cells[k] > 0:
+            count[cells[k]] += 1
+    label = np.zeros(len(count), np.int32)
+    steps = np.array([-line - 1, -line, -line + 1, -1, 1, line - 1, line, line + 1])
+    stack = np.empty(len(count), np.int64)
+    best = pieces = 0
+    best_size = 0
+    for first in range(line, len(count) - line):
+        if count[first] == 0 or label[first] > 0:
+            continue
+        pieces += 1
+        size, top = 0, 1
+        stack[0] = first
+        label[first] = pieces
+        while top > 0:
+            top -= 1
+            cell = stack[top]
+            size += count[cell]
+            for step in steps:
+                other = cell + step
+                if count[other] > 0 and label[other] == 0:
+                    label[other] = pieces
+                    stack[top] = other
+                    top += 1
+        if size > best_size:
+            best, best_size = pieces, size
+    for k in range(n):
+        if cells[k] > 0 and label[cells[k]] == best:
+            result[members[k]] = True
+    return result
+
+
+@kernel
+def points_near(
+    points: Any, free: Any, normal: Any, offset: Any, reach: Any, across: Any, origin: Any, allowed: Any, centre: Any
+) -> Any:
+    """Of the free ones among points (N, 3), which (M,) lie within reach of a plane in the allowed cells (n, m) of it,
+    and where, from the centre (M, 3)."""
+    n = len(points)
+    near, local = np.empty(n + 1, np.int64), np.empty((n + 1, 3), np.float32)
+    flags = np.empty(n, np.uint8)
+    flat = points.reshape(-1)
+    a, b, c = normal[0], normal[1], normal[2]
+    for i in range(n):
+        at = np.uint64(i) * np.uint64(3)
+        x, y, z = flat[at], flat[at + np.uint64(1)], flat[at + np.uint64(2)]
+        flags[i] = (abs(a * x + b * y + c * z - offset) < reach) & free[i]
+    found = np.uint64(0)
+    for i in range(n):
+        near[found] = i
+        found += np.uint64(flags[i])
+    kept = np.uint64(0)
+    height, width = allowed.shape
+    for k in range(int(found)):
+        i = near[k]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        u = int(np.floor(across[0, 0] * x + across[0, 1] * y + across[0, 2] * z)) - origin[0]
+        v = int(np.floor(across[1, 0] * x + across[1, 1] * y + across[1, 2] * z)) - origin[1]
+        near[kept] = i
+        local[kept, 0], local[kept, 1], local[kept, 2] = x - centre[0], y - centre[1], z - centre[2]
+        inside = (u >= 0) & (u < height) & (v >= 0) & (v < width)
+        kept += np.uint64(inside and allowed[u, v])
+    return near[: int(kept)], local[: int(kept)]
+
+
+@summing_kernel
+def moments(local: Any, inside: Any) -> Any:
+    """Mean (3,) and covariance (3, 3) of those of the points (M, 3) that are inside (M,), 0 or 1."""
+    flat = local.reshape(-1)
+    s_1 = s_x = s_y = s_z = s_xx = s_xy = s_xz = s_yy = s_yz = s_zz = 0.0
+    for i in range(len(inside)):
+        at = np.uint64(i) * np.uint64(3)
+        x, y, z = np.float64(flat[at]), np.float64(flat[at + np.uint64(1)]), np.float64(flat[at + np.uint64(2)])
+        weight = np.float64(inside[i])
+        x_in, y_in, z_in = x * weight, y * weight, z * weight
+        s_1 += weight
+        s_x += x_in
+        s_y += y_in
+        s_z += z_in
+        s_xx += x_in * x
+        s_xy += x_in * y
+        s_xz += x_in * z
+        s_yy += y_in * y
+        s_yz += y_in * z
+        s_zz += z_in * z
+    mean = np.array([s_x, s_y, s_z]) / s_1
+    second = np.array([[s_xx, s_xy, s_xz], [s_xy, s_yy, s_yz], [s_xz, s_yz, s_zz]]) / s_1
+    return mean, second - np.outer(mean, mean)
