@@ -1,5 +1,7 @@
 """What moved between places, and a known corner seen again, on scenes built of plain points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,6 +96,25 @@ def test_the_target_is_seen_again_with_what_borders_it() -> None:
         assert np.linalg.norm(candidate.corner - corner) < 0.004
         np.testing.assert_allclose(candidate.normals, reference.normals, atol=0.01)
     assert any(abs(plane.normal[2]) > 0.999 for plane in found[0].obstacles)
+
+
+def test_whole_faces_are_seen_again_by_a_reference_that_shows_a_part_of_them() -> None:
+    """As where what moved is told from what stood still: a face's foot is next to the ground, and counts as such."""
+    rng = np.random.default_rng(4)
+    whole = sighting(rng)
+    part = replace(whole, outlines=tuple(o[0] + 0.6 * (o - o[0]) for o in whole.outlines), support=150)
+    frames = [seen(ground(rng), cube(corner, rng)[0], corner, whole) for corner in CORNERS]
+    around = [surroundings(f, part, c, 0.4) for f, c in zip(frames, CORNERS, strict=True)]
+    found = sight_again(around, part, CORNERS, part_at=0)
+    assert found is not None
+    for candidate, corner in zip(found, CORNERS, strict=True):
+        for outline in candidate.outlines:
+            far = np.linalg.norm(outline - corner, axis=1).max()
+            assert 0.9 * SIZE_M * np.sqrt(2.0) < far < 1.05 * SIZE_M * np.sqrt(2.0)
+    # Where the rest of a face is something else, the corner is none.
+    bent = around[0].copy()
+    bent[:, 2] += np.where(np.linalg.norm(bent - CORNERS[0], axis=1) < 0.2, 0.0, 0.5)
+    assert sight_again([bent, *around[1:]], part, CORNERS, part_at=0) is None
 
 
 @pytest.mark.parametrize("wrong", ["gone", "a face hidden", "turned"])

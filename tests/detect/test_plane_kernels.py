@@ -65,7 +65,7 @@ def test_eigenvalues_and_vectors_of_small_matrices() -> None:
 
 def test_the_largest_piece_is_the_same() -> None:
     """Crumbs of points on a plane, among them pieces of the same size, of which the first one counts."""
-    from lidarpose.detect.cloud_planes import _largest_component
+    from lidarpose.detect.cloud_planes import largest_component
 
     plane = Plane(np.array([0.3, -0.2, 1.0]), 1.0)
     across = np.stack(perpendicular_pair(plane.normal))
@@ -78,7 +78,7 @@ def test_the_largest_piece_is_the_same() -> None:
         pieces = []
         for way in (False, True):
             with compiled.forced(way):
-                pieces.append(_largest_component(points, inside, plane))
+                pieces.append(largest_component(points, inside, plane))
         assert 0 < np.count_nonzero(pieces[0]) <= np.count_nonzero(inside)
         np.testing.assert_array_equal(pieces[0], pieces[1])
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from lidarpose.detect.crop import inside_box
-from lidarpose.detect.moved_points import moved_points
 from lidarpose.detect.trihedral_corner import FaceMask
 from lidarpose.geometry import compiled
 from lidarpose.geometry.arrays import FloatArray, unit
@@ -81,25 +80,6 @@ def test_the_same_points_are_in_a_box(dtype: type[np.floating[Any]]) -> None:
     with compiled.forced(True):
         border = inside_box(points[5:7], np.array([0.5, 1.0, -2.0]), np.array([1.5, 2.0, -1.0]))
     assert len(border) == 0
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_same_points_have_moved(dtype: type[np.floating[Any]]) -> None:
-    """Frames of a box as large as a room, a small cloud that stands elsewhere in each, and points out of reach."""
-    rng = np.random.default_rng(7)
-    frames = []
-    for k in range(3):
-        still = rng.uniform(-6.0, 6.0, (15_000, 3))
-        still[np.arange(len(still)), rng.integers(0, 3, len(still))] = 6.0
-        target = rng.uniform(0.0, 0.4, (400, 3)) + [1.5 * k, -1.0, 0.5]
-        frames.append(np.concatenate([still, target, rng.uniform(20.0, 30.0, (50, 3))]).astype(dtype))
-    with compiled.forced(False):
-        expected = moved_points(frames)
-    with compiled.forced(True):
-        found = moved_points(frames)
-    for mine, theirs in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(mine, theirs)
-        assert len(mine) > 300
 
 
 def test_a_calibration_is_the_same_to_the_bit() -> None:

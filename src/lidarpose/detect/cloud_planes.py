@@ -30,7 +30,7 @@ from lidarpose.detect.plane_raster import (
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, perpendicular_pair
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.planes import Plane
-from lidarpose.geometry.robust import mad_sigma
+from lidarpose.geometry.robust import mad_sigma, quantile
 from lidarpose.model.plane_patch import PlanePatch
 
 Float32Array = NDArray[np.float32]
@@ -406,7 +406,7 @@ def _noise_from_neighbourhoods(thickness: FloatArray) -> float:
     """The noise across flat neighbourhoods: of all, the thinnest fifth is flat almost surely."""
     if len(thickness) == 0:
         return MIN_SIGMA_M
-    return max(float(np.quantile(thickness, 0.2)), MIN_SIGMA_M)
+    return max(quantile(thickness, 0.2), MIN_SIGMA_M)
 
 
 def _harvest(x: Float32Array, free: BoolArray, sample: _Sample, least: int, at_most: int) -> list[PlanePatch]:
@@ -451,7 +451,7 @@ def _best_patch(sample: _Sample, active: BoolArray, votes: Float32Array) -> tupl
         near = np.unpackbits(sample.near[leader].view(np.uint8), count=len(active)).view(bool)
         inside = near & active
         plane = Plane(sample.planes[leader, :3], sample.planes[leader, 3])
-        component = _largest_component(sample.points, inside, plane)
+        component = largest_component(sample.points, inside, plane)
         size = int(np.count_nonzero(component))
         if best is None or size > best[0]:
             best = size, plane, component, int(leader)
@@ -463,7 +463,7 @@ def _best_patch(sample: _Sample, active: BoolArray, votes: Float32Array) -> tupl
         plane = _moment_plane(sample.points[component])
         distance = np.abs(sample.points @ plane.normal.astype(np.float32) - np.float32(plane.offset))
         inside = (distance < GATE_SIGMAS * sample.sigma_m) & active
-        component = _largest_component(sample.points, inside, plane)
+        component = largest_component(sample.points, inside, plane)
     return plane, component, leader_index
 
 
@@ -476,7 +476,7 @@ def _moment_plane(points: NDArray[np.floating]) -> Plane:
     return Plane(normal, offset) if offset <= 0.0 else Plane(-normal, -offset)
 
 
-def _largest_component(points: Float32Array, inside: BoolArray, plane: Plane) -> BoolArray:
+def largest_component(points: Float32Array, inside: BoolArray, plane: Plane) -> BoolArray:
     """Of the points `inside` (S,), those of the largest piece that hangs together across gaps, on the plane."""
     if pays(0.0, KERNELS):
         from lidarpose.detect.patch_kernels import largest_piece

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
+from lidarpose.detect.cloud_planes import PlaneSearch, largest_component, segment_planes
 from lidarpose.detect.trihedral_corner import FaceMask, corner_of_faces, in_outline
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
@@ -45,14 +46,21 @@ def _mode(values: FloatArray, width: float) -> float:
     return float(ordered[first : ends[first]].mean())
 
 
-def surroundings(points: NDArray[np.floating[Any]], reference: CornerCandidate, corner: FloatArray) -> FloatArray:
+def surroundings(
+    points: NDArray[np.floating[Any]], reference: CornerCandidate, corner: FloatArray, around_m: float = AROUND_M
+) -> FloatArray:
     """The points (M, 3) of a cloud that `sight_again` has to see where the reference's target stands at a corner."""
     reach = max(float(np.linalg.norm(o - reference.corner, axis=1).max()) for o in reference.outlines)
-    return _within(points, corner, 1.2 * reach + AROUND_M)
+    return _within(points, corner, 1.2 * reach + around_m)
 
 
 def sight_again(
-    places: Sequence[FloatArray], reference: CornerCandidate, corners: FloatArray, *, seed: int = 0
+    places: Sequence[FloatArray],
+    reference: CornerCandidate,
+    corners: FloatArray,
+    *,
+    seed: int = 0,
+    part_at: int | None = None,
 ) -> list[CornerCandidate] | None:
     """The reference's target near given spots at some places.
 
@@ -64,23 +72,31 @@ def sight_again(
         A sighting of the target, which was not turned in between.
     corners : (P, 3)
         Where it should be at each place, to a few centimetres.
+    part_at
+        The place at which the reference was seen, where its outlines show but a part of each face; how far the faces
+        reach is then found out there.
 
     Returns
     -------
     A sighting for each place, with the faces' own planes, outlines and obstacles. None where at some place one of the
     faces is not there, or most of the beams towards it end elsewhere.
     """
-    faces, rest = [], []
+    planes, rest = [], []
     for local, corner in zip(places, corners, strict=True):
-        here = _faces(local, reference, corner)
+        here = _planes(local, reference, corner)
         if here is None:
             return None
-        faces.append(here)
-        off = np.min([np.abs(plane.distance(local)) for plane, _ in here], axis=0)
+        planes.append(here)
+        off = np.min([np.abs(plane.distance(local)) for plane in here], axis=0)
         rest.append(local[off > GATE_SIGMAS * reference.sigma_m])
     standing = _standing_planes(np.concatenate(rest), seed)
+    if part_at is not None:
+        whole = _whole(places[part_at], planes[part_at], standing, reference)
+        if whole is None:
+            return None
+        reference = whole
     found = []
-    for local, here, corner in zip(places, faces, corners, strict=True):
+    for local, here, corner in zip(places, planes, corners, strict=True):
         sighting = _sighting(local, here, standing, reference, corner)
         if sighting is None:
             return None
@@ -88,13 +104,38 @@ def sight_again(
     return found
 
 
+def _whole(
+    local: FloatArray, planes: Sequence[Plane], standing: Sequence[Plane], reference: CornerCandidate
+) -> CornerCandidate | None:
+    """The reference with whole faces: all that hangs together on each of its planes; None where that is no corner."""
+    everywhere = np.arange(len(local))
+    patches = _shared_out(local, [(plane, everywhere) for plane in planes], standing, reference.sigma_m)
+    single = local.astype(np.float32)
+    faces = []
+    for patch in patches[:3]:
+        mine = np.zeros(len(local), dtype=bool)
+        mine[patch.indices] = True
+        together = np.flatnonzero(largest_component(single, mine, patch.plane))
+        if len(together) < FEWEST:
+            return None
+        faces.append(replace(patch, indices=together))
+    bordering = [patch for patch in patches[3:] if len(patch) >= FEWEST]
+    found = corner_of_faces(local, (*faces, *bordering))
+    if found is None or found.convex != reference.convex or found.support < reference.support // 2:
+        return None
+    return found if np.linalg.norm(found.corner - reference.corner) < NEAR_M else None
+
+
 def _sighting(
     local: FloatArray,
-    faces: Sequence[tuple[Plane, IntArray]],
+    planes: Sequence[Plane],
     standing: Sequence[Plane],
     reference: CornerCandidate,
     corner: FloatArray,
 ) -> CornerCandidate | None:
+    columns = np.ascontiguousarray(local.T)
+    own = _meeting(planes)
+    faces = [(plane, _over_outline(columns, reference, k, own, BORDER_M)[0]) for k, plane in enumerate(planes)]
     patches = _shared_out(local, faces, standing, reference.sigma_m)
     if min(len(patch) for patch in patches[:3]) < FEWEST:
         return None
@@ -103,6 +144,10 @@ def _sighting(
     if found is None or found.convex != reference.convex or np.linalg.norm(found.corner - corner) > NEAR_M:
         return None
     return found if _is_in_view(local, found, reference) else None
+
+
+def _meeting(planes: Sequence[Plane]) -> FloatArray:
+    return np.asarray(np.linalg.solve([p.normal for p in planes], [p.offset for p in planes]))
 
 
 def _within(points: NDArray[np.floating[Any]], centre: FloatArray, radius: float) -> FloatArray:
@@ -115,8 +160,8 @@ def _within(points: NDArray[np.floating[Any]], centre: FloatArray, radius: float
     return np.asarray(slab[np.einsum("ij,ij->i", offset, offset) < radius * radius], dtype=np.float64)
 
 
-def _faces(local: FloatArray, reference: CornerCandidate, corner: FloatArray) -> list[tuple[Plane, IntArray]] | None:
-    """The three planes of the target near their known places, and the points that may lie on each."""
+def _planes(local: FloatArray, reference: CornerCandidate, corner: FloatArray) -> list[Plane] | None:
+    """The three planes of the target near their known places."""
     columns = np.ascontiguousarray(local.T)
     planes = []
     for k, normal in enumerate(reference.normals):
@@ -128,10 +173,7 @@ def _faces(local: FloatArray, reference: CornerCandidate, corner: FloatArray) ->
         if plane is None:
             return None
         planes.append(plane)
-    own = np.linalg.solve([p.normal for p in planes], [p.offset for p in planes])
-    if np.linalg.norm(own - corner) > NEAR_M:
-        return None
-    return [(plane, _over_outline(columns, reference, k, own, BORDER_M)[0]) for k, plane in enumerate(planes)]
+    return planes if np.linalg.norm(_meeting(planes) - corner) < NEAR_M else None
 
 
 def _over_outline(

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
-from lidarpose.geometry.compiled import pays
+from lidarpose.geometry.arrays import IntArray
 
 CELL_M = 0.15
 # A surface that stands still returns within this of where it did: some times the range noise.
@@ -22,8 +21,8 @@ SLACK_M = 0.04
 REACH_M = 16.0
 # Fewer moved points in a cell are mixed pixels and noise.
 FEWEST_IN_A_CELL = 3
-# By how much kernels are done sooner, on one core.
-SAVED_S_PER_POINT = 2e-8
+
+Float32Array = NDArray[np.float32]
 
 
 def moved_points(frames: Sequence[NDArray[np.floating[Any]]]) -> tuple[IntArray, ...]:
@@ -32,47 +31,45 @@ def moved_points(frames: Sequence[NDArray[np.floating[Any]]]) -> tuple[IntArray,
     Parameters
     ----------
     frames
-        One frame of each of a few places, metres, finite, the sensor unmoved.
+        One frame of each of a few places, eight at most, metres, finite, the sensor unmoved.
     """
-    rows = [np.ascontiguousarray(frame.T) for frame in frames]
+    rows = [np.ascontiguousarray(frame.T, dtype=np.float32) for frame in frames]
     low = np.min([f.min(axis=1) for f in rows], axis=0).clip(-REACH_M, REACH_M) - 2.0 * CELL_M
     high = np.max([f.max(axis=1) for f in rows], axis=0).clip(-REACH_M, REACH_M) + 2.0 * CELL_M
     shape = np.ceil((high - low) / CELL_M).astype(np.int64) + 1
     grids = [_Cells(columns, low, shape) for columns in rows]
-    return tuple(grid.left_by([other.taken for other in grids if other is not grid]) for grid in grids)
+    # One map of all frames, a bit each.
+    taken = np.zeros(int(np.prod(shape)), dtype=np.uint8)
+    for k, grid in enumerate(grids):
+        taken[grid.cell] |= np.uint8(1 << k)
+    everyone = (1 << len(grids)) - 1
+    return tuple(grid.left_by(taken, np.uint8(everyone - (1 << k))) for k, grid in enumerate(grids))
 
 
 class _Cells:
-    """A frame's points (3, N) within reach, the cell of each, and all cells that hold any of them or nearly do."""
+    """A frame's points (3, N) within reach in units of cells, and the cell (N,) of each."""
 
-    def __init__(self, columns: NDArray[np.floating[Any]], low: FloatArray, shape: IntArray) -> None:
-        strides = np.array([shape[1] * shape[2], shape[2], 1], dtype=np.int32)
-        columns = columns.astype(np.float32, copy=False)
-        near = np.abs(columns) < REACH_M
+    def __init__(self, columns: Float32Array, low: Float32Array, shape: IntArray) -> None:
+        near = np.abs(columns) < np.float32(REACH_M)
         self.index = np.flatnonzero(near[0] & near[1] & near[2])
-        scaled = columns.take(self.index, axis=1)
-        scaled -= low[:, None].astype(np.float32)
-        scaled /= np.float32(CELL_M)
-        self.cell = strides @ scaled.astype(np.int32)
-        self.taken: BoolArray = np.zeros(int(np.prod(shape)), dtype=bool)
-        slack = np.float32(SLACK_M / CELL_M)
-        if pays(SAVED_S_PER_POINT * len(self.index), "detect.target_kernels"):
-            from lidarpose.detect.target_kernels import mark_cells
+        self.scaled = columns.take(self.index, axis=1)
+        self.scaled -= low[:, None]
+        self.scaled *= np.float32(1.0 / CELL_M)
+        self.strides = np.array([shape[1] * shape[2], shape[2], 1], dtype=np.int32)
+        x, y, z = self.scaled.astype(np.int32) * self.strides[:, None]
+        self.cell = x + y + z
 
-            mark_cells(scaled, slack, strides, self.taken)
-            return
-        ends = [(scaled + step).astype(np.int32) * strides[:, None] for step in (-slack, slack)]
-        for x in ends:
-            for y in ends:
-                plane = x[0] + y[1]
-                for z in ends:
-                    self.taken[plane + z[2]] = True
-
-    def left_by(self, others: Sequence[BoolArray]) -> IntArray:
-        """The points in cells that no other frame has taken, but for lone ones."""
-        free = np.ones(len(self.cell), dtype=bool)
-        for taken in others:
-            free &= ~taken[self.cell]
-        alone = np.flatnonzero(free)
+    def left_by(self, taken: NDArray[np.uint8], others: np.uint8) -> IntArray:
+        """The points that no other frame's cells hold or nearly do, but for lone ones."""
+        # Most stand where others do to the cell; of the rest it is asked more closely.
+        alone = np.flatnonzero((taken.take(self.cell) & others) == 0)
+        alone = alone[((taken.take(self._cells_around(alone)) & others) == 0).all(axis=0)]
         _, number, count = np.unique(self.cell[alone], return_inverse=True, return_counts=True)
         return np.asarray(self.index[alone[count[number] >= FEWEST_IN_A_CELL]])
+
+    def _cells_around(self, chosen: IntArray) -> NDArray[np.int32]:
+        """The cells (8, M) in which a point stands that is moved by the slack along each axis, to and fro."""
+        scaled, slack = self.scaled.take(chosen, axis=1), np.float32(SLACK_M / CELL_M)
+        ends = np.stack([(scaled + step).astype(np.int32) * self.strides[:, None] for step in (-slack, slack)])
+        x, y, z = ends.swapaxes(0, 1)
+        return np.asarray((x[:, None, None] + y[:, None] + z).reshape(8, -1))

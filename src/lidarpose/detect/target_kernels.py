@@ -38,19 +38,6 @@ def points_in_box(points: Any, order: Any, middle: Any, half: Any) -> Any:
 
 
 @kernel
-def mark_cells(places: Any, slack: Any, strides: Any, taken: Any) -> None:
-    """Set `taken` where points (3, N), in cells, stand or nearly do: those moved by `slack` along each axis."""
-    x, y, z = places[0], places[1], places[2]
-    for i in range(len(x)):
-        for along_x in (-slack, slack):
-            u = np.int32(x[i] + along_x) * strides[0]
-            for along_y in (-slack, slack):
-                v = u + np.int32(y[i] + along_y) * strides[1]
-                for along_z in (-slack, slack):
-                    taken[np.uint64(v + np.int32(z[i] + along_z) * strides[2])] = True
-
-
-@kernel
 def faces_met(
     rays: Any,
     range_m: Any,

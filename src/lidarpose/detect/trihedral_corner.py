@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, cross3, perpendicular_pair, unit
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.planes import Plane, intersect_three_planes
+from lidarpose.geometry.robust import quantile
 from lidarpose.model.corner_result import CornerCandidate
 from lidarpose.model.plane_patch import PlanePatch
 
@@ -103,7 +104,7 @@ def _candidate(surfaces: list[_Surface], triple: IntArray, corner: FloatArray) -
             return None
         local.append(around)
     distances = [np.linalg.norm(p - corner, axis=1) for p in local]
-    reach = min(float(np.quantile(d, 0.98)) for d in distances)
+    reach = min(quantile(d, 0.98) for d in distances)
     convex = _common_side(_next_to_corner(local, distances, reach), faces)
     if convex is None:
         # A face may go on past a narrow one, as the floor does past the side of a niche.
@@ -153,7 +154,7 @@ def _narrowest_m(local: list[FloatArray], faces: list[PlanePatch], corner: Float
     reach = []
     for a, b in combinations(range(3), 2):
         edge = unit(cross3(faces[a].plane.normal, faces[b].plane.normal))
-        reach += [float(np.quantile(np.abs((local[k] - corner) @ edge), 0.98)) for k in (a, b)]
+        reach += [quantile(np.abs((local[k] - corner) @ edge), 0.98) for k in (a, b)]
     return min(reach)
 
 

@@ -61,11 +61,17 @@ def wrap_angle(angle_rad: ArrayLike) -> Any:
 
 def perpendicular_pair(direction: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Two unit vectors u, v with (u, v, direction) right-handed; `direction` is (3,), need not be unit."""
-    w = unit(direction)
-    helper = np.zeros(3)
-    helper[int(np.argmin(np.abs(w)))] = 1.0
-    u = unit(cross3(helper, w))
-    return u, cross3(w, u)
+    x, y, z = np.asarray(direction, dtype=np.float64).tolist()
+    length = math.sqrt(x * x + y * y + z * z)
+    if not length > 0.0:
+        raise ValueError("a vector of length zero has no direction")
+    w = x, y, z = x / length, y / length, z / length
+    # The cross product with the axis that is least along the direction, written out.
+    least = min(range(3), key=lambda k: abs(w[k]))
+    p, q, r = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))[least]
+    across = math.sqrt(p * p + q * q + r * r)
+    p, q, r = p / across, q / across, r / across
+    return np.array([p, q, r]), np.array([y * r - z * q, z * p - x * r, x * q - y * p])
 
 
 def all_finite(arrays: Iterable[ArrayLike]) -> bool:

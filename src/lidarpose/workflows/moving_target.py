@@ -33,7 +33,7 @@ MOST_CORNERS = 3
 FEWEST_MOVED = 60
 # A scan of more points is searched as a whole: a subsample of it shows the target as well.
 MOST_POINTS = 4_000_000
-# What lies about the target beyond its faces, for the planes that border it.
+# What lies about the target beyond what of it is known to have moved: the rest of its faces, and what borders them.
 AROUND_M = 0.4
 
 Points = NDArray[np.floating[Any]]
@@ -81,13 +81,13 @@ def find_by_motion(session: CornerSession, world: FloatArray, *, seed: int = 0) 
 def _widest_triangle(world: FloatArray) -> tuple[int, int, int]:
     """The three places whose triangle has the greatest height."""
 
-    def height(triple: tuple[int, int, int]) -> float:
-        p, q, r = world[list(triple)]
-        longest = max(float(np.linalg.norm(side)) for side in (q - p, r - p, q - r))
-        return float(np.linalg.norm(np.cross(q - p, r - p))) / max(longest, 1e-9)
-
     few = np.unique(np.linspace(0, len(world) - 1, min(len(world), MOST_PLACES)).round().astype(int)).tolist()
-    return max(combinations(few, 3), key=height)
+    triples = np.array(list(combinations(few, 3)))
+    p, q, r = world[triples].swapaxes(0, 1)
+    longest = np.max([np.linalg.norm(side, axis=1) for side in (q - p, r - p, q - r)], axis=0)
+    height = np.linalg.norm(np.cross(q - p, r - p), axis=1) / np.maximum(longest, 1e-9)
+    a, b, c = triples[int(np.argmax(height))].tolist()
+    return a, b, c
 
 
 def _followed(
@@ -101,20 +101,16 @@ def _followed(
 ) -> list[CornerCandidate] | None:
     """The corner at all places, if it moves as the world coordinates say."""
     three = list(frames)
-    reference: CornerCandidate | None = None
     for elsewhere in (_by_normals, _by_search):
         corners = np.stack([corner.corner if k == first else elsewhere(moved[k], corner, search) for k in three])
         if not _as_far_apart(corners, world[three]):
             continue
-        reference = reference or _whole(frames[first], corner, search)
-        if reference is None:
-            return None
         expected = svd_pose(world[three], corners).inverse() @ world
         around = []
         for k, place in enumerate(session.places):
             points = frames[k] if k in frames else load_points(place.clouds[0])
-            around.append(surroundings(points, reference, expected[k]))
-        sightings = sight_again(around, reference, expected, seed=search.seed)
+            around.append(surroundings(points, corner, expected[k], AROUND_M))
+        sightings = sight_again(around, corner, expected, seed=search.seed, part_at=first)
         if sightings is not None:
             return sightings
     return None
@@ -140,16 +136,3 @@ def _as_far_apart(corners: FloatArray, world: FloatArray) -> bool:
         abs(np.linalg.norm(corners[a] - corners[b]) - np.linalg.norm(world[a] - world[b])) < TOLERANCE_M
         for a, b in pairs
     )
-
-
-def _whole(frame: Points, corner: CornerCandidate, search: PlaneSearch) -> CornerCandidate | None:
-    """The corner with all that is around it, not of the moved points alone: whole faces, and what borders them."""
-    reach = max(float(np.linalg.norm(o - corner.corner, axis=1).max()) for o in corner.outlines) + AROUND_M
-    offset = frame - corner.corner.astype(frame.dtype)
-    local = frame[np.einsum("ij,ij->i", offset, offset) < reach**2]
-    found = [
-        c
-        for c in find_corners(local, segment_planes(local, search), corner.corner, TOLERANCE_M)
-        if c.convex == corner.convex and c.support >= corner.support // 2
-    ]
-    return found[0] if len(found) == 1 else None
