@@ -37,6 +37,7 @@ from lidarpose.refine.corner_verdict import (
     judge_corner_fit,
     judge_corners,
 )
+from lidarpose.refine.face_rims import without_rims
 from lidarpose.refine.ring_offsets import RingOffsets, find_rings, ring_offsets, rings_seem_off
 from lidarpose.solve.corner_alignment import cayley_pose, pair_scale, svd_pose
 from lidarpose.solve.corner_matching import face_order
@@ -247,7 +248,7 @@ def _joint(
     start, sigma_m = _start(mended, found, fits)
     corners = _corners(start, fits, found, sighted=not alone)
     places, _ = observe(mended, found, few, corners, start.normals, sigma_m)
-    fit, _ = _fit(mended, places, start, sigma_m, scale_too, FIRST_SETTLED)
+    fit, first = _fit(mended, places, start, sigma_m, scale_too, FIRST_SETTLED)
     # Then from all, with the faces' beams selected by the estimate itself.
     corners = _expected(fit, places, found.world)
     observed, left_out = observe(mended, found, crops, corners, fit.state.normals, fit.range_sigma_m)
@@ -257,6 +258,7 @@ def _joint(
         if len(p.faces) == 3 and p.frames > 1
     }
     places, frame_scatter, dropped = _without_odd_frames(observed, by_frame)
+    places = without_rims(places, fit.state.normals, corners, fit.range_sigma_m, _common_error(fit, first, places))
     fit, used = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too)
     fit, used, offsets = _without_ring_offsets(mended, fit, used)
     left_out += [
@@ -294,6 +296,13 @@ def _expected(fit: CornerFit, places: Sequence[CornerPlaceFaces], world: FloatAr
     errors = np.zeros_like(world)
     errors[[i for i, p in enumerate(places) if p.faces]] = fit.state.world_errors
     return replace(fit.state, world_errors=errors).corners(world)
+
+
+def _common_error(fit: CornerFit, first: Sequence[CornerPlaceFaces], places: Sequence[CornerPlaceFaces]) -> float:
+    """By how much spots' means will scatter more than the noise allows, in squares, by the part that was fitted first:
+    what they err together does not fall as their noise does."""
+    count, few = (sum(len(f) for p in some for f in p.faces.values()) for some in (places, first))
+    return 1.0 + (common_error_factor(fit, first) - 1.0) * count / few
 
 
 def _turns(

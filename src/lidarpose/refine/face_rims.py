@@ -1,0 +1,161 @@
+"""Where the faces of a target end: what is seen just outside of them is left out, by all places' returns together.
+
+A board is seen with its edge, a carton with the ground at its foot: surfaces that leave a face's plane by millimetres
+over the first centimetre, within the noise of single returns, and always to the same side. At one place they are too
+few to be told, yet many enough to turn the face by more than its returns' noise does. The target is the same at all
+places, and the rays, which carry no noise, tell where on its faces each return lies: so the returns of all places near
+one side of a face are taken together, ordered from the outside inwards, and tested for a step: the largest of all
+means from the outermost return on, over its standard deviation (Page 1954).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, unit
+from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
+from lidarpose.refine.corner_model import tangents
+
+# A side's returns are tested this far inwards, or for this share of the face where that is less.
+STRIP_M, STRIP_SHARE = 0.04, 0.2
+# A mean of so many standard deviations is no noise: chance makes one on a side in fifty.
+STEP_SIGMAS = 3.0
+CLIP_SIGMAS = 4.0
+# Half a beam's width, and a little: a beam this far inside a side meets the face alone.
+GUARD_M, GUARD_RAD = 0.002, 0.0015
+MOST_GRAZING, GUARD_SHARE = 0.2, 0.1
+# Of a lone scan line nothing is tested, and a face's few returns are no face.
+THINNEST_M, FEWEST_RETURNS = 0.01, 8
+OUTLINE_DIRECTIONS = 128
+MOST_FOR_OUTLINE = 8000
+# Sides shorter than this share of the face are rounding of its outline; two this alike in direction are one.
+SIDE_SHARE = 0.15
+SAME_SIDE_COS = np.cos(np.radians(20.0))
+# Where two faces meet, their edge is known by their planes.
+SEAM_M, SEAM_COS = 0.03, 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class _Face:
+    """A face's returns at all places.
+
+    Attributes
+    ----------
+    points : (2, N)
+        Where the rays meet the face, in its plane, from the corner (m).
+    residual : (N,)
+        Measured minus expected range, in standard deviations of a single return.
+    place : (N,)
+        Which place each return is of.
+    toward : (P, 2), distance_m : (P,)
+        Of each place: the unit direction to the corner along the plane's axes, and the distance.
+    """
+
+    points: FloatArray
+    residual: FloatArray
+    place: IntArray
+    toward: FloatArray
+    distance_m: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """A straight side of a face: the direction (2,) outwards in its plane, and how far out it lies."""
+
+    outward: FloatArray
+    reach_m: float
+
+
+def without_rims(
+    places: Sequence[CornerPlaceFaces],
+    normals: FloatArray,
+    corners: FloatArray,
+    sigma_m: float,
+    common_error: float = 1.0,
+) -> list[CornerPlaceFaces]:
+    """The places without what lies outside the target's faces, or so near their sides that beams meet both.
+
+    Parameters
+    ----------
+    places
+        What seems to be of the faces.
+    normals, corners : (3, 3), (P, 3)
+        The faces' unit normals and the corner at each place, both nearly right.
+    sigma_m
+        The ranges' noise.
+    common_error
+        By how much spots' means scatter more than the noise allows, in squares.
+    """
+    kept = [dict(p.faces) for p in places]
+    for j in range(3):
+        rows = [i for i, p in enumerate(places) if j in p.faces]
+        if not rows:
+            continue
+        axes = tangents(normals[j]).T
+        face = _face([places[i].faces[j] for i in rows], normals[j], axes, corners[rows], sigma_m)
+        seams = unit(np.stack([axes @ normals[k] for k in range(3) if k != j]))
+        inside = _inside(face, _sides(face.points, seams), STEP_SIGMAS * np.sqrt(common_error))
+        for k, i in enumerate(rows):
+            mine = inside[face.place == k]
+            if np.count_nonzero(mine) < FEWEST_RETURNS:
+                del kept[i][j]
+            elif not mine.all():
+                kept[i][j] = kept[i][j].subset(np.flatnonzero(mine))
+    return [replace(p, faces=k) for p, k in zip(places, kept, strict=True)]
+
+
+def _face(
+    returns: Sequence[FaceReturns], normal: FloatArray, axes: FloatArray, corners: FloatArray, sigma_m: float
+) -> _Face:
+    points, residuals = [], []
+    for f, corner in zip(returns, corners, strict=True):
+        expected = (normal @ corner) / (normal @ f.rays)
+        points.append((axes @ f.rays) * expected - (axes @ corner)[:, None])
+        residuals.append(f.range_m - expected)
+    residual = np.clip(np.concatenate(residuals) / sigma_m, -CLIP_SIGMAS, CLIP_SIGMAS)
+    distance = np.linalg.norm(corners, axis=1)
+    place = np.repeat(np.arange(len(returns)), [len(f) for f in returns])
+    return _Face(np.concatenate(points, axis=1), residual, place, corners @ axes.T / distance[:, None], distance)
+
+
+def _sides(points: FloatArray, seams: FloatArray) -> list[_Side]:
+    """The straight sides of the outline of points (2, N) but those along the lines through 0 across `seams` (2, 2)."""
+    few = points[:, :: max(points.shape[1] // MOST_FOR_OUTLINE, 1)]
+    angle = np.linspace(0.0, 2.0 * np.pi, OUTLINE_DIRECTIONS, endpoint=False)
+    outermost = np.argmax(few.T @ np.stack([np.cos(angle), np.sin(angle)]), axis=0)
+    vertices = few[:, outermost[outermost != np.roll(outermost, 1)]].T
+    edges = np.roll(vertices, -1, axis=0) - vertices
+    length = np.linalg.norm(edges, axis=1)
+    outward = np.column_stack([edges[:, 1], -edges[:, 0]]) / np.maximum(length, 1e-12)[:, None]
+    middle = vertices + 0.5 * edges
+    seam = ((np.abs(middle @ seams.T) < SEAM_M) & (np.abs(outward @ seams.T) > SEAM_COS)).any(axis=1)
+    sides: list[_Side] = []
+    for k in np.argsort(-length):
+        if length[k] < SIDE_SHARE * np.ptp(few, axis=1).max():
+            break
+        if not seam[k] and all(outward[k] @ other.outward < SAME_SIDE_COS for other in sides):
+            sides.append(_Side(outward[k], float(outward[k] @ vertices[k])))
+    return sides
+
+
+def _inside(face: _Face, sides: Sequence[_Side], step_sigmas: float) -> BoolArray:
+    """Which returns (N,) are of the face alone."""
+    inside = np.ones(len(face.residual), dtype=bool)
+    for side in sides:
+        inwards = side.reach_m - side.outward @ face.points
+        across = float(inwards.max())
+        if across < THINNEST_M:
+            continue
+        strip = np.flatnonzero(inwards < min(STRIP_M, STRIP_SHARE * across))
+        strip = strip[np.argsort(inwards[strip], kind="stable")]
+        sums = np.abs(np.cumsum(face.residual[strip])) / np.sqrt(np.arange(1, len(strip) + 1))
+        step = int(np.argmax(sums))
+        end = inwards[strip[step]] if sums[step] > step_sigmas else 0.0
+        # A beam's width is stretched where it meets the face at a grazing angle.
+        seen = np.sqrt(1.0 - (face.toward @ side.outward) ** 2)
+        guard = (GUARD_M + GUARD_RAD * face.distance_m) / np.maximum(seen, MOST_GRAZING)
+        inside &= inwards > end + np.minimum(guard, GUARD_SHARE * across)[face.place]
+    return inside
