@@ -64,8 +64,8 @@ FEWER_RETURNS = 0.6
 MIN_FRAMES_FOR_BOX_PLOT = 5
 # Returns around the target, of all frames of a place together, from which the first estimate is made.
 FIRST_RETURNS = 3000
-# That estimate's last step, in standard deviations.
-FIRST_SETTLED = 0.1
+# What is left to go after that estimate's last step, in standard deviations.
+FIRST_SETTLED = 0.01
 SMALL_TURN_RAD = np.radians(3.0)
 # Offsets of rings, and how much else spots err together, are estimated in turn.
 RING_STEPS = 3
