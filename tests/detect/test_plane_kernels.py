@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from benchmarks.suites.plane_search import scene
+from scipy.spatial import cKDTree
 
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.geometry import compiled
@@ -47,6 +48,15 @@ def test_patches_of_a_cloud_that_is_searched_whole_are_the_same() -> None:
     """And those that come up once the large ones are gone, from several subsamples, down to the clutter's."""
     points, _ = scene(20_000, 0.02, 1)
     assert_the_same(both_ways(points, PlaneSearch(from_sensor=True)))
+
+
+@pytest.mark.parametrize("n", [13, 64, 65, 1500])
+def test_nearest_points_are_those_of_a_tree(n: int) -> None:
+    from lidarpose.detect.patch_kernels import nearest
+
+    points = np.random.default_rng(n).normal(size=(n, 3)).astype(np.float32)
+    seeds = points[::7]
+    np.testing.assert_array_equal(nearest(points, seeds, 12), cKDTree(points).query(seeds, k=12)[1])
 
 
 def test_eigenvalues_and_vectors_of_small_matrices() -> None:

@@ -64,6 +64,8 @@ REFITS = 3
 DENSE_RIVALS = 2
 DENSE_REFITS = 1
 POINTS_PER_HYPOTHESIS = 10
+# Of trees that are asked few times: wide leaves are built sooner.
+LEAF_SIZE = 32
 GATE_SIGMAS = 3.0
 MIN_SIGMA_M = 2e-4
 # A patch spreads more than its neighbourhoods say, by up to this factor; a wider slab would take in two surfaces.
@@ -370,7 +372,7 @@ class _Neighbourhoods:
         from scipy.spatial import cKDTree
 
         widest = min(NEIGHBOURHOODS[-1], len(self.cloud))
-        tree = cKDTree(self.cloud, compact_nodes=False, balanced_tree=False)
+        tree = cKDTree(self.cloud, LEAF_SIZE, compact_nodes=False, balanced_tree=False)
         _, neighbours = tree.query(self.cloud[self.seeds], k=widest)
         reach = np.minimum(np.array(NEIGHBOURHOODS)[np.arange(len(self.seeds)) % len(NEIGHBOURHOODS)], widest)
         picks = (self.shares * reach[:, None]).astype(np.int64)
@@ -588,19 +590,23 @@ def _neighbours_agree(points: Float32Array, normal: FloatArray, sigma_m: float) 
     """The corner paper's second screening, of a whole patch: whether the normals that points (V, 3) have by their own
     neighbours are mostly the plane's. Neighbours along one scan line, no wider than the noise, have no normal; where
     two thirds are such, nobody is asked."""
-    from scipy.spatial import cKDTree
-
     if len(points) <= SCREENING_NEIGHBOURS:
         return True
     seeds = points[:: max(len(points) // SCREENED_POINTS, 1)]
-    _, neighbours = cKDTree(points, compact_nodes=False, balanced_tree=False).query(seeds, k=SCREENING_NEIGHBOURS)
-    around = points[neighbours].astype(np.float64)
-    d = around - around.mean(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(d.swapaxes(1, 2) @ d / SCREENING_NEIGHBOURS)
-    known = _has_normal(values, sigma_m)
+    if pays(0.0, KERNELS):
+        from lidarpose.detect.patch_kernels import nearest
+
+        neighbours = nearest(points, seeds, SCREENING_NEIGHBOURS)
+    else:
+        from scipy.spatial import cKDTree
+
+        tree = cKDTree(points, LEAF_SIZE, compact_nodes=False, balanced_tree=False)
+        neighbours = tree.query(seeds, k=SCREENING_NEIGHBOURS)[1]
+    planes, variances = _local_planes(points[neighbours])
+    known = _has_normal(variances, sigma_m)
     if np.count_nonzero(known) < ASKED_SHARE * len(known):
         return True
-    return _mostly_agree(vectors[known, :, 0], normal)
+    return _mostly_agree(planes[known, :3], normal)
 
 
 def _one_a_voxel(points: Float32Array, side_m: float) -> IntArray:

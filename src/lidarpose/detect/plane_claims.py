@@ -130,6 +130,11 @@ class _Claims(Protocol):
     """Points of a block near one patch, at least those in its cells."""
 
     @property
+    def index(self) -> NDArray[np.integer]:
+        """Which of the block's (M,)."""
+        ...
+
+    @property
     def indices(self) -> IntArray:
         """Which of the cloud's (M,)."""
         ...
@@ -170,22 +175,27 @@ class _Claims(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Terms:
-    """Claims as NumPy makes them: with all that is known of each point."""
+    """Claims as NumPy makes them: with all that is known of each point. `index` (M,) counts from number `first` on."""
 
-    indices: IntArray
+    first: int
+    index: IntArray
     terms: Float32Array
     held: BoolArray
     disputed: IntArray
+
+    @property
+    def indices(self) -> IntArray:
+        return self.index + self.first
 
     def held_count(self) -> int:
         return int(np.count_nonzero(self.held))
 
     def some(self, every: int) -> IntArray:
-        return self.indices[self.held & _runs(every, 1)[self.indices % BLOCK]]
+        return self.indices[self.held & _runs(every, 1).take(self.index)]
 
     def some_rest(self, every: int, lean: FloatArray) -> Float32Array:
-        few = np.flatnonzero(self.held & _runs(every, RUN)[self.indices % BLOCK])
-        return _rest(self.terms.take(few, axis=1), lean)
+        few = np.flatnonzero(_runs(every, RUN).take(self.index))
+        return _rest(self.terms.take(few[self.held.take(few)], axis=1), lean)
 
     def moments(self, slab: Slab, lean: FloatArray) -> FloatArray:
         rest = _rest(self.terms, lean) if lean.any() else self.terms[1]
@@ -337,7 +347,8 @@ def patches_of_slabs(
 def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab], block: slice) -> list[_Part]:
     """What each slab claims of a block of the points."""
     points = np.empty((4, block.stop - block.start), dtype=np.float32)
-    np.copyto(points[:3], x[block].T, casting="same_kind")
+    # Rounded first: their own order is that of memory.
+    points[:3] = x[block].astype(np.float32, copy=False).T
     points[3] = 1.0
     rows = np.zeros((-(-len(slabs) // SLABS_AT_ONCE) * SLABS_AT_ONCE, 4), dtype=np.float32)
     rows[: len(slabs)] = [s.rows[1] / (CLAIM_SIGMAS * s.sigma_m) for s in slabs]
@@ -367,7 +378,7 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
         found.append((indices, terms, held, doubtful))
     parts: list[_Part] = []
     for slab, (indices, terms, held, doubtful) in zip(slabs, found, strict=True):
-        claims = _Terms(indices + block.start, terms, held, doubtful[times[indices[doubtful]] > 1])
+        claims = _Terms(block.start, indices, terms, held, doubtful[times[indices[doubtful]] > 1])
         parts.append((claims, claims.moments(slab, np.zeros(3))))
     return parts
 
@@ -478,10 +489,10 @@ def _members(block: slice, parts: Sequence[_Part], fits: Sequence[_Fit | None]) 
             continue
         mine = (np.abs(_rest(claims.terms, fit.lean)) < np.float32(GATE_SIGMAS * fit.sigma_m)) & claims.held
         disputed = claims.disputed[mine[claims.disputed]]
-        places = claims.indices[disputed] - block.start
+        places = claims.index[disputed]
         mine[disputed] = ~taken[places]
         taken[places] = True
-        members.append(claims.indices[mine])
+        members.append(claims.index[mine] + block.start)
     return members
 
 
