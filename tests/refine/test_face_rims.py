@@ -79,3 +79,24 @@ def test_a_face_of_one_scan_line_is_kept() -> None:
     thin = FaceReturns(on_line / range_m[:, None], range_m, np.zeros(20, dtype=np.int64))
     single = [CornerPlaceFaces("0", corner, {0: thin}, 1)]
     assert len(without_rims(single, NORMALS, CORNERS[:1], SIGMA_M)[0].faces[0]) >= 15
+
+
+def test_ground_that_one_place_takes_for_a_face_is_left_out() -> None:
+    """The ground 2 cm below the floor, seen as far as 0.4 m beyond it, at one place of four."""
+    found, rng = places(0.0, 3), np.random.default_rng(3)
+    along = np.column_stack([rng.uniform(0.0, SIZE_M, 1000), rng.uniform(SIZE_M, SIZE_M + 0.4, 1000)])
+    edges = unit(np.linalg.inv(NORMALS).T)[1:]
+    ground = CORNERS[1] + along @ edges
+    to_face = np.linalg.norm(ground, axis=1)
+    rays = ground / to_face[:, None]
+    measured = to_face - 0.02 / (rays @ NORMALS[0]) + rng.normal(0.0, SIGMA_M, 1000)
+    floor = found[1].faces[0]
+    both = FaceReturns(
+        np.concatenate([floor.directions, rays]),
+        np.concatenate([floor.range_m, measured]),
+        np.zeros(2500, dtype=np.int64),
+    )
+    found[1] = CornerPlaceFaces("1", CORNERS[1], {**found[1].faces, 0: both}, 1)
+    left = without_rims(found, NORMALS, CORNERS, SIGMA_M)[1].faces[0]
+    assert 1300 < len(left) <= 1510
+    assert np.count_nonzero(np.isin(left.range_m, measured)) <= 10

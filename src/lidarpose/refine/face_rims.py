@@ -97,7 +97,7 @@ def without_rims(
         axes = tangents(normals[j]).T
         face = _face([places[i].faces[j] for i in rows], normals[j], axes, corners[rows], sigma_m)
         seams = unit(np.stack([axes @ normals[k] for k in range(3) if k != j]))
-        inside = _inside(face, _sides(face.points, seams), STEP_SIGMAS * np.sqrt(common_error))
+        inside = _inside(face, _sides(face, seams), STEP_SIGMAS * np.sqrt(common_error))
         for k, i in enumerate(rows):
             mine = inside[face.place == k]
             if np.count_nonzero(mine) < FEWEST_RETURNS:
@@ -121,12 +121,10 @@ def _face(
     return _Face(np.concatenate(points, axis=1), residual, place, corners @ axes.T / distance[:, None], distance)
 
 
-def _sides(points: FloatArray, seams: FloatArray) -> list[_Side]:
-    """The straight sides of the outline of points (2, N) but those along the lines through 0 across `seams` (2, 2)."""
-    few = points[:, :: max(points.shape[1] // MOST_FOR_OUTLINE, 1)]
-    angle = np.linspace(0.0, 2.0 * np.pi, OUTLINE_DIRECTIONS, endpoint=False)
-    outermost = np.argmax(few.T @ np.stack([np.cos(angle), np.sin(angle)]), axis=0)
-    vertices = few[:, outermost[outermost != np.roll(outermost, 1)]].T
+def _sides(face: _Face, seams: FloatArray) -> list[_Side]:
+    """The straight sides of a face but those along the lines through 0 across `seams` (2, 2)."""
+    few = _common_part(face)
+    vertices = _vertices(few)
     edges = np.roll(vertices, -1, axis=0) - vertices
     length = np.linalg.norm(edges, axis=1)
     outward = np.column_stack([edges[:, 1], -edges[:, 0]]) / np.maximum(length, 1e-12)[:, None]
@@ -141,6 +139,30 @@ def _sides(points: FloatArray, seams: FloatArray) -> list[_Side]:
     return sides
 
 
+def _directions() -> FloatArray:
+    angle = np.linspace(0.0, 2.0 * np.pi, OUTLINE_DIRECTIONS, endpoint=False)
+    return np.stack([np.cos(angle), np.sin(angle)])
+
+
+def _vertices(points: FloatArray) -> FloatArray:
+    """Those of the points (2, N) that are farthest out (V, 2), counter-clockwise."""
+    outermost = np.argmax(points.T @ _directions(), axis=0)
+    return np.asarray(points[:, outermost[outermost != np.roll(outermost, 1)]].T)
+
+
+def _common_part(face: _Face) -> FloatArray:
+    """Some of a face's points (2, N), those no farther out in any direction than half of the places reach.
+
+    Where the ground lies 2 cm below a face, a single place may show it as the face's own.
+    """
+    step = max(len(face.place) // MOST_FOR_OUTLINE, 1)
+    points, place = face.points[:, ::step], face.place[::step]
+    out = points.T @ _directions()
+    reach = [out[place == k].max(axis=0) for k in range(len(face.distance_m)) if (place == k).any()]
+    common = (out <= np.median(reach, axis=0) + 1e-9).all(axis=1)
+    return np.asarray(points[:, common] if np.count_nonzero(common) > FEWEST_RETURNS else points)
+
+
 def _inside(face: _Face, sides: Sequence[_Side], step_sigmas: float) -> BoolArray:
     """Which returns (N,) are of the face alone."""
     inside = np.ones(len(face.residual), dtype=bool)
@@ -149,13 +171,25 @@ def _inside(face: _Face, sides: Sequence[_Side], step_sigmas: float) -> BoolArra
         across = float(inwards.max())
         if across < THINNEST_M:
             continue
-        strip = np.flatnonzero(inwards < min(STRIP_M, STRIP_SHARE * across))
+        inside &= ~_foreign_beyond(face, inwards, step_sigmas)
+        strip = np.flatnonzero((inwards < min(STRIP_M, STRIP_SHARE * across)) & inside)
+        if len(strip) == 0:
+            continue
         strip = strip[np.argsort(inwards[strip], kind="stable")]
         sums = np.abs(np.cumsum(face.residual[strip])) / np.sqrt(np.arange(1, len(strip) + 1))
         step = int(np.argmax(sums))
-        end = inwards[strip[step]] if sums[step] > step_sigmas else 0.0
+        end = inwards[strip[step if sums[step] > step_sigmas else 0]]
         # A beam's width is stretched where it meets the face at a grazing angle.
         seen = np.sqrt(1.0 - (face.toward @ side.outward) ** 2)
         guard = (GUARD_M + GUARD_RAD * face.distance_m) / np.maximum(seen, MOST_GRAZING)
         inside &= inwards > end + np.minimum(guard, GUARD_SHARE * across)[face.place]
     return inside
+
+
+def _foreign_beyond(face: _Face, inwards: FloatArray, step_sigmas: float) -> BoolArray:
+    """Which returns (N,) lie farther out than half of the places reach, at places where these are off the face."""
+    beyond = inwards < 0.0
+    count = np.bincount(face.place[beyond], minlength=len(face.distance_m))
+    total = np.bincount(face.place[beyond], face.residual[beyond], len(face.distance_m))
+    foreign = np.abs(total) > step_sigmas * np.sqrt(np.maximum(count, 1))
+    return np.asarray(beyond & foreign[face.place])
