@@ -203,7 +203,9 @@ def _solve(data: JointData, start: JointState, active: IntArray, max_iterations:
         # Most of the way on few rows of each line; the last steps on all of them.
         few = thinned(data, _COARSE_ROWS)
         coarse = _iterate(few, start, active, max_iterations, None, with_places)
-        state, spent, earlier = coarse.at.state, coarse.iterations, coarse.noise
+        # How many neighbouring rows are worth one is found anew where others are neighbours.
+        noise = replace(coarse.noise, lines={k: replace(n, rows_as_one=1.0) for k, n in coarse.noise.lines.items()})
+        state, spent, earlier = coarse.at.state, coarse.iterations, noise
         data = _with_growth(data, _growth(data, _among_all(data, coarse)))
     done = _iterate(data, state, active, max_iterations, earlier, with_places)
     if earlier is None:
