@@ -125,13 +125,12 @@ def _sums_at_lags(values: FloatArray, line_of_row: IntArray) -> FloatArray:
 
     By the Fourier transform, with so many zeros between lines that none meets the next.
     """
-    first = int(line_of_row[0])
-    size = len(values) + _MOST_LAGS * (int(line_of_row[-1]) - first + 1)
-    spread = np.zeros(_smooth_size(size))
-    spread[np.arange(len(values)) + _MOST_LAGS * (line_of_row - first)] = values
+    line = line_of_row - line_of_row[0]
+    lags = min(_MOST_LAGS, int(np.bincount(line).max()))
+    spread = np.zeros(_smooth_size(len(values) + lags * (int(line[-1]) + 1)))
+    spread[np.arange(len(values)) + lags * line] = values
     spectrum = np.fft.rfft(spread)
-    power = spectrum.real**2 + spectrum.imag**2
-    return np.asarray(np.fft.irfft(power, len(spread))[1 : min(_MOST_LAGS, len(values) - 1) + 1])
+    return np.asarray(np.fft.irfft(spectrum.real**2 + spectrum.imag**2, len(spread))[1 : lags + 1])
 
 
 def _smooth_size(least: int) -> int:

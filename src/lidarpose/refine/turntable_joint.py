@@ -38,9 +38,10 @@ from lidarpose.refine.noise import (
 )
 from lidarpose.refine.place_effects import PlaceEffects, place_effects
 from lidarpose.refine.turntable_layout import JointData, Lines, thinned
-from lidarpose.refine.turntable_parameters import CAMERA_EXTRAS, EXTRAS, N_GLOBAL, N_MOTION
+from lidarpose.refine.turntable_parameters import CAMERA_EXTRAS, EXTRAS, N_GLOBAL, N_MOTION, RANGE_EXTRAS
 from lidarpose.refine.turntable_residuals import (
     CornerResiduals,
+    Frames,
     LineResiduals,
     corner_residuals,
     range_residuals,
@@ -136,12 +137,15 @@ def lines_of(data: JointData, kind: Kind) -> Lines:
     return data.stripes.lines if kind == "stripes" else data.ranges.lines
 
 
-def linearise(data: JointData, state: JointState) -> Linearised:
+def linearise(data: JointData, state: JointState, active: IntArray | None = None) -> Linearised:
+    """Residuals and derivatives at a state; of lines by the `active` parameters only, if these are given."""
+    frames = Frames.at(data, state)
+    extras = {*CAMERA_EXTRAS, *RANGE_EXTRAS} if active is None else set(active.tolist())
     lines: dict[Kind, LineResiduals] = {}
     if data.stripes.lines.count:
-        lines["stripes"] = stripe_residuals(data, state)
+        lines["stripes"] = stripe_residuals(data, state, frames, of_camera=not extras.isdisjoint(CAMERA_EXTRAS))
     if data.ranges.lines.count:
-        lines["ranges"] = range_residuals(data, state)
+        lines["ranges"] = range_residuals(data, state, frames, extras=extras)
     return Linearised(state, tuple(corner_residuals(data, state, k) for k in range(len(data.slots))), lines)
 
 
@@ -206,7 +210,7 @@ def _solve(data: JointData, start: JointState, active: IntArray, max_iterations:
         # How many neighbouring rows are worth one is found anew where others are neighbours.
         noise = replace(coarse.noise, lines={k: replace(n, rows_as_one=1.0) for k, n in coarse.noise.lines.items()})
         state, spent, earlier = coarse.at.state, coarse.iterations, noise
-        data = _with_growth(data, _growth(data, _among_all(data, coarse)))
+        data = _with_growth(data, _growth(data, _among_all(data, coarse, active)))
     done = _iterate(data, state, active, max_iterations, earlier, with_places)
     if earlier is None:
         growth = _growth(data, done)
@@ -217,12 +221,13 @@ def _solve(data: JointData, start: JointState, active: IntArray, max_iterations:
     if not with_places:
         moments = all_moments(data, done.at, noise)
         noise = update_noise(data, done.at, noise, moments, active, soft=False, with_places=True)
-    return _finish(data, done.at, noise, active, spent + done.iterations, done.converged)
+    whole = linearise(data, done.at.state)
+    return _finish(data, whole, noise, active, spent + done.iterations, done.converged)
 
 
-def _among_all(data: JointData, coarse: _Progress) -> _Progress:
+def _among_all(data: JointData, coarse: _Progress, active: IntArray) -> _Progress:
     """An estimate on few rows, as it lies among all rows."""
-    at = linearise(data, coarse.at.state)
+    at = linearise(data, coarse.at.state, active)
     return replace(coarse, at=at, noise=carried_over(data, at, coarse.noise))
 
 
@@ -265,7 +270,7 @@ def _iterate(
     with_places: bool,
 ) -> _Progress:
     """Steps until neither parameters nor noise move. `earlier`: the noise of a nearly finished estimate."""
-    at = linearise(data, start)
+    at = linearise(data, start, active)
     noise = first_noise(data, at) if earlier is None else carried_over(data, at, earlier)
     soft_until, places_from, least = (3, 8, 10) if earlier is None else (0, 0, 2)
     damping, calm, iteration = 1e-6, 0, 0
@@ -318,7 +323,7 @@ def _damped_step(
         full = np.zeros(N_GLOBAL + 6 * len(data.slots))
         full[active] = step
         expected = float(step @ equations.gradient)
-        new = linearise(data, at.state.moved(full, data.centres))
+        new = linearise(data, at.state.moved(full, data.centres), active)
         moments = all_moments(data, new, noise)
         cost = sum_of_squares(data, new, noise, moments)
         if cost <= equations.sum_of_squares * (1.0 + 1e-9) + 1e-9:

@@ -7,6 +7,7 @@ the estimate costs one pass over the rows whatever the number of parameters.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,7 @@ from lidarpose.refine.turntable_parameters import (
     N_GLOBAL,
     N_MOTION,
     OFFSET,
+    RANGE_EXTRAS,
     RANGE_SCALE,
 )
 from lidarpose.refine.turntable_state import JointState
@@ -34,7 +36,8 @@ class LineResiduals:
     """Residuals (N,) of lines of one kind, the basis of their derivatives, and how it maps to the parameters.
 
     ``d residual = basis @ to_parameters[line] @ step``: basis (N, b), to_parameters (S, b, N_GLOBAL + 6), whose last
-    six columns are of the line's own panel. The basis stands in the first of `columns`, see `line_columns`.
+    six columns are of the line's own panel. The basis stands in the first of `columns`, see `line_columns`. It may
+    lack what only parameters need that are held.
     """
 
     residual: FloatArray
@@ -85,6 +88,25 @@ def corrected_camera(camera: Camera, extras: FloatArray) -> Camera:
     return replace(camera, K=K)
 
 
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Where places and panels are at a state, with derivatives: see `JointState.turned`, `_panel_geometry` and
+    `panel_jacobians`."""
+
+    R_place: FloatArray
+    t_place: FloatArray
+    J_place: FloatArray
+    R_panel: FloatArray
+    t_panel: FloatArray
+    map_panel: FloatArray
+    J_panel: FloatArray
+
+    @staticmethod
+    def at(data: JointData, state: JointState) -> Frames:
+        places = state.turned(data.angles_rad, data.reference_rad)
+        return Frames(*places, *_panel_geometry(data, state), panel_jacobians(state, data))
+
+
 def _panel_geometry(data: JointData, state: JointState) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Of each panel: rotation (K, 3, 3), centre (K, 3) in the camera frame, and the maps (K, 6, 3).
 
@@ -112,22 +134,23 @@ def panel_jacobians(state: JointState, data: JointData) -> FloatArray:
     return np.array(adjoints).reshape(-1, 6, 6)
 
 
-def stripe_residuals(data: JointData, state: JointState) -> LineResiduals:
+def stripe_residuals(data: JointData, state: JointState, frames: Frames, *, of_camera: bool) -> LineResiduals:
     """Distance in pixels of each stripe point from the predicted stripe, along its measured normal.
+
+    `of_camera`: whether the basis is to hold what the camera's extra parameters need.
 
     The ray through the pixel meets the panel in P; its distance from the light plane, over the rate at which that
     distance changes per pixel across the stripe, is to first order the pixel distance from the intersection curve.
     """
     rows, lines = data.stripes, data.stripes.lines
     of_row = lines.line_of_row
-    R_place, t_place, J_place = state.turned(data.angles_rad, data.reference_rad)
-    R_panel, t_panel, map_panel = _panel_geometry(data, state)
+    R_place, t_place, R_panel, t_panel = frames.R_place, frames.t_place, frames.R_panel, frames.t_panel
     if np.any(state.extras[np.array(CAMERA_EXTRAS) - N_MOTION] != 0.0):
         rows = stripe_rays(corrected_camera(data.camera, state.extras), lines, rows.pixels, rows.normals)
     offset = np.einsum("ki,ki->k", R_panel[:, :, 2], t_panel)[lines.slot][of_row]
     height = np.einsum("mi,mi->m", R_place[:, :, 2], t_place)[lines.place][of_row]
-    products = _stripe_products(rows, R_panel[lines.slot], R_place[lines.place][:, :, 2])
-    ray_n, ray_m, px_n, px_m, focal_n, focal_m, x_n, x_m, y_n, y_m, ray_x, ray_y, px_x, px_y = products
+    products = _stripe_products(rows, R_panel[lines.slot], R_place[lines.place][:, :, 2], 5 if of_camera else 2)
+    ray_x, ray_y, px_x, px_y, ray_n, ray_m, px_n, px_m = products[:8]
     with np.errstate(divide="ignore", invalid="ignore"):
         # From the measured pixel to the stripe, then once more from the point found there: the residual is exact to
         # second order, and the derivatives, taken on the stripe, do not depend on the pixel's own noise.
@@ -154,49 +177,56 @@ def stripe_residuals(data: JointData, state: JointState) -> LineResiduals:
         inverse * (depth * (ray_x - on_stripe * px_x) - centre[:, 0]),
         inverse * (depth * (ray_y - on_stripe * px_y) - centre[:, 1]),
     )
-    # Of the point on the stripe too: at the measured pixel the focal length would take the noise's square for signal.
-    focal_m, focal_n = focal_m + on_stripe * px_m, focal_n + on_stripe * px_n
-    by_camera = [inverse * depth * (m - alpha * n) for m, n in ((focal_m, focal_n), (x_m, x_n), (y_m, y_n))]
-    basis = (*by_light, *(alpha * column for column in by_light), *by_camera)
-    to = np.zeros((lines.count, 9, N_GLOBAL + 6))
+    basis = [*by_light, *(alpha * column for column in by_light)]
+    if of_camera:
+        focal_n, focal_m, x_n, x_m, y_n, y_m = products[8:]
+        # Of the point on the stripe too: at the measured pixel the focal length would take the noise's square for
+        # signal.
+        focal_m, focal_n = focal_m + on_stripe * px_m, focal_n + on_stripe * px_n
+        basis += [inverse * depth * (m - alpha * n) for m, n in ((focal_m, focal_n), (x_m, x_n), (y_m, y_n))]
+    to = np.zeros((lines.count, len(basis), N_GLOBAL + 6))
     light = _moment_map(R_place[lines.place, :, 2], R_panel[lines.slot], t_panel[lines.slot])
-    to[:, :3, : N_MOTION + 1] = -np.swapaxes(light, 1, 2) @ J_place[lines.place]
-    J_panel = panel_jacobians(state, data)
-    to[:, 3:6, N_GLOBAL:] = np.swapaxes(map_panel[lines.slot], 1, 2) @ J_panel[lines.slot]
-    for column, p in enumerate(CAMERA_EXTRAS, start=6):
-        to[:, column, p] = 1.0
+    to[:, :3, : N_MOTION + 1] = -np.swapaxes(light, 1, 2) @ frames.J_place[lines.place]
+    to[:, 3:6, N_GLOBAL:] = np.swapaxes(frames.map_panel[lines.slot], 1, 2) @ frames.J_panel[lines.slot]
+    if of_camera:
+        for column, p in enumerate(CAMERA_EXTRAS, start=6):
+            to[:, column, p] = 1.0
     return LineResiduals(on_stripe, line_columns(basis, lines.along, on_stripe), to, valid)
 
 
 _LARGEST_STEP_PX = 100.0
 
 
-def _stripe_products(rows: StripeRows, R_panel: FloatArray, light_normal: FloatArray) -> FloatArray:
-    """Products (14, N) of each row's ray and its derivatives with its line's vectors.
+def _stripe_products(rows: StripeRows, R_panel: FloatArray, light_normal: FloatArray, count: int) -> FloatArray:
+    """Products (4 + 2 count, N) of each row's ray and its derivatives with its line's vectors.
 
-    The ray and its derivatives by a pixel, the focal scale and the principal point, each with the panel's normal and
-    with the light plane's (S, 3); last the ray and its derivative by a pixel with the panel's two axes. One small
-    matrix product a line.
+    First the ray and its derivative by a pixel with the panel's two axes; then of the first `count` (two at least) of
+    the ray and its derivatives by a pixel, the focal scale and the principal point each with the panel's normal and
+    with the light plane's (S, 3). One small matrix product a line.
     """
-    joined = rows.joined
-    factors = np.zeros((rows.lines.count, 15, 14))
-    for k in range(5):
-        factors[:, 3 * k : 3 * k + 3, 2 * k] = R_panel[:, :, 2]
-        factors[:, 3 * k : 3 * k + 3, 2 * k + 1] = light_normal
-    factors[:, :3, 10:12] = factors[:, 3:6, 12:] = R_panel[:, :, :2]
-    out = np.empty((len(joined), 14))
-    start = rows.lines.start
+    joined = rows.joined[:, : 3 * count]
+    factors = np.zeros((rows.lines.count, 3 * count, 4 + 2 * count))
+    factors[:, :3, :2] = factors[:, 3:6, 2:4] = R_panel[:, :, :2]
+    for k in range(count):
+        factors[:, 3 * k : 3 * k + 3, 4 + 2 * k] = R_panel[:, :, 2]
+        factors[:, 3 * k : 3 * k + 3, 5 + 2 * k] = light_normal
+    out = np.empty((len(joined), factors.shape[2]))
+    start = rows.lines.start.tolist()
     for j in range(rows.lines.count):
         np.matmul(joined[start[j] : start[j + 1]], factors[j], out=out[start[j] : start[j + 1]])
     return np.ascontiguousarray(out.T)
 
 
-def range_residuals(data: JointData, state: JointState) -> LineResiduals:
-    """Measured range less the beam's distance to the panel's plane, along the beam."""
+def range_residuals(
+    data: JointData, state: JointState, frames: Frames, *, extras: Collection[int] = RANGE_EXTRAS
+) -> LineResiduals:
+    """Measured range less the beam's distance to the panel's plane, along the beam.
+
+    `extras`: those of `RANGE_EXTRAS` whose derivatives the basis is to hold.
+    """
     rows, lines = data.ranges, data.ranges.lines
     of_row = lines.line_of_row
-    R_place, t_place, J_place = state.turned(data.angles_rad, data.reference_rad)
-    R_panel, t_panel, map_panel = _panel_geometry(data, state)
+    R_place, t_place, R_panel, t_panel = frames.R_place, frames.t_place, frames.R_panel, frames.t_panel
     offset_m, scale, beam, black = state.extras[np.array([OFFSET, RANGE_SCALE, BEAM, BLACK]) - N_MOTION]
     angle = (1.0 + beam) * rows.angle_rad
     c, s = rows.beams if beam == 0.0 else (np.cos(angle), np.sin(angle))
@@ -215,14 +245,22 @@ def range_residuals(data: JointData, state: JointState) -> LineResiduals:
     axes = to_panel @ R_place[lines.place]
     X, Y = (start[:, k][of_row] + predicted * (c * axes[:, k, 0][of_row] + s * axes[:, k, 1][of_row]) for k in range(2))
     grow = inverse * (1.0 + scale)
-    d_angle = -predicted * (-s * n_lidar[:, 0] + c * n_lidar[:, 1]) * grow
-    flag = valid.astype(np.float64)
-    basis = (grow, grow * X, grow * Y, -flag, -predicted, -d_angle * rows.angle_rad, -flag * rows.darkness)
-    to = np.zeros((lines.count, 7, N_GLOBAL + 6))
-    plane = np.swapaxes(map_panel[lines.slot], 1, 2)
-    to[:, :3, : N_MOTION + 1] = plane @ J_place[lines.place]
-    to[:, :3, N_GLOBAL:] = -plane @ panel_jacobians(state, data)[lines.slot]
-    for row, column in zip(range(3, 7), (OFFSET, RANGE_SCALE, BEAM, BLACK), strict=True):
+    basis, flag = [grow, grow * X, grow * Y], valid.astype(np.float64)
+    kept = [p for p in RANGE_EXTRAS if p in extras]
+    for p in kept:
+        if p == OFFSET:
+            basis.append(-flag)
+        elif p == RANGE_SCALE:
+            basis.append(-predicted)
+        elif p == BEAM:
+            basis.append(predicted * (-s * n_lidar[:, 0] + c * n_lidar[:, 1]) * grow * rows.angle_rad)
+        else:
+            basis.append(-flag * rows.darkness)
+    to = np.zeros((lines.count, len(basis), N_GLOBAL + 6))
+    plane = np.swapaxes(frames.map_panel[lines.slot], 1, 2)
+    to[:, :3, : N_MOTION + 1] = plane @ frames.J_place[lines.place]
+    to[:, :3, N_GLOBAL:] = -plane @ frames.J_panel[lines.slot]
+    for row, column in enumerate(kept, start=3):
         to[:, row, column] = 1.0
     residual = rows.range_m - (1.0 + scale) * predicted - offset_m - black * rows.darkness
     residual = np.where(valid, residual, 0.0)
