@@ -27,10 +27,11 @@ from lidarpose.model.plane_patch import PlanePatch
 
 Float32Array = NDArray[np.float32]
 
-# Points of a block: its coordinates, heights and masks stay in a core's cache, and its matrix products are too small
-# for OpenBLAS to share out among threads, which these blocks already keep busy: two slabs at once are, a single one
-# would not be, as products with a vector have another limit.
-BLOCK = 32_000
+# Points of a block, at most: its coordinates, heights and masks stay in a core's cache.
+BLOCK = 64_000
+# Matrix products of so many points and slabs are too small for OpenBLAS to share out among threads, which the blocks
+# already keep busy; a single slab's would not be, as products with a vector have another limit.
+POINTS_AT_ONCE = 32_000
 SLABS_AT_ONCE = 2
 # By how much kernels are done sooner, on two cores, where some planes are looked for.
 SAVED_S_PER_POINT = 1e-8
@@ -299,7 +300,9 @@ class Claim:
 
 
 def _blocks(x: NDArray[np.floating]) -> list[slice]:
-    return [slice(first, min(first + BLOCK, len(x))) for first in range(0, len(x), BLOCK)]
+    """An even number of blocks, all alike, for two cores to be busy equally long."""
+    each = -(-len(x) // (2 * -(-len(x) // (2 * BLOCK)))) if len(x) else 1
+    return [slice(first, min(first + each, len(x))) for first in range(0, len(x), each)]
 
 
 def patches_of_slabs(
@@ -355,7 +358,9 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
     height = np.empty((len(rows), points.shape[1]), dtype=np.float32)
     for first in range(0, len(slabs), SLABS_AT_ONCE):
         some = slice(first, first + SLABS_AT_ONCE)
-        np.matmul(rows[some], points, out=height[some])
+        for part in range(0, points.shape[1], POINTS_AT_ONCE):
+            columns = slice(part, part + POINTS_AT_ONCE)
+            np.matmul(rows[some], points[:, columns], out=height[some, columns])
     height = height[: len(slabs)]
     near = np.abs(height, out=height) < np.float32(1.0)
     if free is not None:
