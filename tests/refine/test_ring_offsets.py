@@ -14,8 +14,9 @@ from lidarpose.geometry.arrays import FloatArray, unit
 from lidarpose.geometry.planes import Plane
 from lidarpose.geometry.se3 import Pose, exp_so3
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
+from lidarpose.refine.beam_crossing import seen_crossing
 from lidarpose.refine.corner_model import CornerFit, CornerState, fit_corner_model
-from lidarpose.refine.ring_offsets import RingOffsets, find_rings, ring_offsets, rings_seem_off
+from lidarpose.refine.ring_offsets import RingOffsets, find_rings, ring_offsets, some_returns
 
 TRUTH = Pose(exp_so3([0.02, 0.1, 0.3]), np.array([0.2, -0.1, 1.0]))
 NORMALS = TRUTH.inverse().rotate(unit(np.array([[-0.3, 0.1, 0.95], [-0.7, 0.7, 0.1], [-0.7, -0.7, 0.1]])))
@@ -43,7 +44,9 @@ def beams() -> dict[tuple[int, int], FloatArray]:
 DIRECTIONS = beams()
 
 
-def observe(rng: np.random.Generator, offset_m: FloatArray) -> list[CornerPlaceFaces]:
+def observe(rng: np.random.Generator, offset_m: FloatArray, crossing_m: float = 0.0) -> list[CornerPlaceFaces]:
+    """Beams start `crossing_m` times the tangent of their elevation below the origin, which directions and ranges leave
+    out."""
     places = []
     for i, world in enumerate(WORLD):
         corner = TRUTH.inverse() @ world
@@ -51,7 +54,9 @@ def observe(rng: np.random.Generator, offset_m: FloatArray) -> list[CornerPlaceF
         for j in range(3):
             u = DIRECTIONS[i, j]
             ring = np.round((np.degrees(np.arcsin(u[:, 2])) + 15.0) / 2.0).astype(int)
-            r = np.linalg.norm(Plane(NORMALS[j], float(NORMALS[j] @ corner)).intersect_rays(u), axis=1)
+            start = np.zeros_like(u)
+            start[:, 2] = -crossing_m * u[:, 2] / np.sqrt(1.0 - u[:, 2] ** 2)
+            r = (NORMALS[j] @ corner - start @ NORMALS[j]) / (u @ NORMALS[j])
             r = r + offset_m[ring] + rng.normal(0.0, SIGMA_M, len(u))
             faces[j] = FaceReturns(u, r, np.zeros(len(u), dtype=np.int64))
         places.append(CornerPlaceFaces(f"p{i}", world, faces, 1))
@@ -104,7 +109,10 @@ def test_without_offsets_nothing_is_found() -> None:
     for _ in range(24):
         places = observe(rng, np.zeros(16))
         assert beside_offsets(places)[1] is None
-        assert not rings_seem_off(plain(places), places)
+        few = some_returns(places)
+        rings = find_rings(few)
+        assert rings is not None
+        assert ring_offsets(plain(places), few, rings) is None
 
 
 def test_the_covariance_is_that_of_generalised_least_squares() -> None:
@@ -148,3 +156,28 @@ def test_directions_that_come_in_no_rings_have_no_offsets() -> None:
         for p in places
     ]
     assert find_rings(shaken) is None
+
+
+def test_a_crossing_of_the_beams_is_told_beside_offsets() -> None:
+    rng = np.random.default_rng(6)
+    for crossing_m in (0.0, 0.04):
+        scores, seen_m, before, after = [], [], [], []
+        for _ in range(16):
+            places = observe(rng, rng.normal(0.0, 0.005, 16), crossing_m)
+            fit, offsets = beside_offsets(places)
+            rings = find_rings(places)
+            assert offsets is not None
+            assert rings is not None
+            seen = seen_crossing(fit, places, rings, offsets.sigma_m, 1.0)
+            assert seen is not None
+            seen_m.append(seen.crossing_m)
+            scores.append((seen.crossing_m - crossing_m) / seen.sigma_m)
+            assert seen.told == (crossing_m > 0.0)
+            before.append(fit.state.T_world_lidar.minus(TRUTH)[:3])
+            after.append((Pose.exp(seen.move[:6]) @ fit.state.T_world_lidar).minus(TRUTH)[:3])
+        if crossing_m == 0.0:
+            assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=0.4)
+        else:
+            # One linear step, and faces that have given way a little.
+            assert np.mean(seen_m) == pytest.approx(crossing_m, rel=0.15)
+            assert np.sum(np.square(after)) < 0.25 * np.sum(np.square(before))

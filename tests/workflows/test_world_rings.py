@@ -8,7 +8,7 @@ import numpy as np
 
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.cloud import Cloud
-from lidarpose.model.corner_session import CloudSource, CornerSession, MemoryCloud
+from lidarpose.model.corner_session import CloudSource, CornerSession, CrossingBeams, MemoryCloud
 from lidarpose.simulate.corner_scene import CornerSceneSpec, simulate_corner_session
 from lidarpose.workflows.world import world_run
 
@@ -40,3 +40,42 @@ def test_lines_that_are_off_do_not_spoil_the_pose() -> None:
     assert off.covariance is not None
     xi = off.T_world_source.minus(truth.T_world_lidar)
     assert xi @ np.linalg.solve(off.covariance, xi) < 20.0
+
+
+CROSSING_M = 0.0419
+
+
+def put_to_their_starts(session: CornerSession) -> CornerSession:
+    def mended(source: CloudSource) -> CrossingBeams:
+        return CrossingBeams(source, CROSSING_M)
+
+    return replace(session, places=tuple(replace(p, clouds=tuple(map(mended, p.clouds))) for p in session.places))
+
+
+def test_beams_that_cross_are_noticed_and_not_moved_unasked() -> None:
+    spec = CornerSceneSpec(lidar="vlp16", frames=4, hints=True, seed=104)
+    straight = world_run(simulate_corner_session(spec)[0]).calibration
+    assert straight.quality is not None
+    assert straight.quality.verdict == "good"
+    assert abs(straight.quality.figures["beam_crossing_left_out_mm"]["value"]) < 10.0
+    crossing, truth = simulate_corner_session(replace(spec, beam_crossing_m=CROSSING_M))
+    offsets = np.random.default_rng(4).normal(0.0, 0.005, 16)
+    for session in (crossing, with_lines_off(crossing, offsets)):
+        left_out = world_run(session).calibration
+        assert left_out.quality is not None
+        # It is some millimetres and 0.2 degrees off, says so, and says why.
+        seen = left_out.quality.figures["beam_crossing_left_out_mm"]
+        assert abs(seen["value"] - 1e3 * CROSSING_M) < 3.0 * seen["sigma"] < 36.0
+        assert left_out.quality.verdict == "doubtful"
+        assert any("beam_crossing_m" in reason for reason in left_out.quality.reasons)
+        assert left_out.T_world_source.distance(truth.T_world_lidar)[1] > np.radians(0.1)
+        assert left_out.covariance is not None
+        xi = left_out.T_world_source.minus(truth.T_world_lidar)
+        assert xi @ np.linalg.solve(left_out.covariance, xi) < 20.0
+        # Stated, all is well.
+        stated = world_run(put_to_their_starts(session)).calibration
+        assert stated.quality is not None
+        assert stated.quality.verdict == "good"
+        metres, radians = stated.T_world_source.distance(truth.T_world_lidar)
+        assert metres < 0.002
+        assert radians < np.radians(0.05)

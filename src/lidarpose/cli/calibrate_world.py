@@ -172,6 +172,13 @@ def summary_lines(calibration: WorldCalibration) -> list[str]:
             f"rings are off by {figures['ring_sigma_mm']:.1f} mm (standard deviation), corrected; most the one at "
             f"{largest[0]} deg, {largest[1]:+.1f} mm"
         )
+    crossing = figures.get("beam_crossing_left_out_mm")
+    # A VLP-16's 42 mm would be seen with less.
+    if crossing is not None and crossing["sigma"] > 10.0:
+        lines.append(
+            "whether the LiDAR's beams cross before its axis is left open by the data (standard deviation "
+            f"{crossing['sigma']:.0f} mm): if its driver lets all beams start at one point, state beam_crossing_m"
+        )
     return lines
 
 

@@ -15,6 +15,7 @@ from lidarpose.model.calibration import Quality, Verdict
 from lidarpose.model.corner_result import CornerPlaceFaces
 from lidarpose.model.corner_session import CloudFrame
 from lidarpose.model.observation import LeftOut
+from lidarpose.refine.beam_crossing import SeenCrossing
 from lidarpose.refine.corner_model import CornerFit, direction_cells, face_residuals, place_discrepancies
 
 # A turn of the target: far beyond chance (three degrees of freedom, six where a place stands by itself) and large
@@ -33,7 +34,8 @@ LEAST_MISFIT_M = 0.002
 class CornerEvidence:
     """What the workflow knows beside the fit.
 
-    `rings_told` are the degrees of freedom that offsets of rings have taken from the residuals.
+    `rings_told` are the degrees of freedom that offsets of rings have taken from the residuals; `crossing` is where a
+    multi-beam LiDAR's beams seem to cross, None where that was not asked.
     """
 
     positions: tuple[str, ...]
@@ -46,6 +48,7 @@ class CornerEvidence:
     turns: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     rings_told: float = 0.0
     further_figures: Mapping[str, Any] = field(default_factory=dict)
+    crossing: SeenCrossing | None = None
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,23 @@ def judge_corner_fit(
     _judge_turns(verdict, places, moves, statistic, known, evidence)
     _judge_world(verdict, fit, places, evidence)
     _judge_noise(verdict, fit, evidence)
+    if evidence.crossing is not None:
+        figures["beam_crossing_left_out_mm"] = {
+            "value": 1e3 * evidence.crossing.crossing_m,
+            "sigma": 1e3 * evidence.crossing.sigma_m,
+        }
+        _judge_crossing(verdict, evidence.crossing)
     return Quality(verdict.verdict, tuple(verdict.reasons), figures)
+
+
+def _judge_crossing(verdict: _Verdict, seen: SeenCrossing) -> None:
+    if seen.told:
+        verdict.doubt(
+            f"the LiDAR's beams seem to cross {1e3 * seen.crossing_m:.0f} mm (standard deviation "
+            f"{1e3 * seen.sigma_m:.0f}) before its axis, beyond what the clouds hold: its driver may let all beams "
+            "start at one point; state the distance of the maker's manual as beam_crossing_m under [lidar] "
+            "(VLP-16: 0.0419)"
+        )
 
 
 def judge_corners(

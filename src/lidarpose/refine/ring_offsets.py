@@ -106,7 +106,7 @@ def find_rings(places: Sequence[CornerPlaceFaces]) -> Rings | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Equations:
+class RingEquations:
     """Normal equations of the estimate's parameters (n) and the offsets (K): blocks of the information, gradients."""
 
     parameters: FloatArray
@@ -122,7 +122,8 @@ class _Equations:
         return 0.5 * (information + information.T), self.ring_pull - self.cross.T @ solved[:, -1]
 
 
-def _equations(fit: CornerFit, places: Sequence[CornerPlaceFaces], rings: Rings) -> _Equations:
+def ring_equations(fit: CornerFit, places: Sequence[CornerPlaceFaces], rings: Rings) -> RingEquations:
+    """Of a joint estimate beside offsets of all rings, at the estimate."""
     count = len(rings.elevation_rad)
     own, ring_pull, systems, crossed = np.zeros(count), np.zeros(count), {}, {}
     corners = fit.state.corners(fit.world)
@@ -137,7 +138,7 @@ def _equations(fit: CornerFit, places: Sequence[CornerPlaceFaces], rings: Rings)
     cross = np.zeros((len(pull), count))
     for key, jacobian in face_jacobians(list(systems), fit.state, fit.world, fit.options).items():
         cross += jacobian.T @ crossed[key]
-    return _Equations(parameters, cross, own, pull, ring_pull)
+    return RingEquations(parameters, cross, own, pull, ring_pull)
 
 
 def _estimate_sigma(information: FloatArray, gradient: FloatArray) -> tuple[float, float]:
@@ -175,7 +176,7 @@ def ring_offsets(
     -------
     The offsets; None where nothing speaks for any.
     """
-    equations = _equations(fit, places, rings)
+    equations = ring_equations(fit, places, rings)
     information, gradient = equations.reduced()
     if before is not None:
         gradient = gradient + information @ before
@@ -190,10 +191,8 @@ def ring_offsets(
     return RingOffsets(rings, offset, sigma_m, gain, covariance, told)
 
 
-def rings_seem_off(fit: CornerFit, places: Sequence[CornerPlaceFaces]) -> bool:
-    """Whether some thousand of the returns speak for offsets of rings."""
+def some_returns(places: Sequence[CornerPlaceFaces]) -> list[CornerPlaceFaces]:
+    """The places with some thousand of their returns."""
     total = sum(len(f) for p in places for f in p.faces.values())
     step = max(total // FEW_RETURNS, 1)
-    few = [replace(p, faces={j: f.subset(np.arange(0, len(f), step)) for j, f in p.faces.items()}) for p in places]
-    rings = find_rings(few)
-    return rings is not None and ring_offsets(fit, few, rings) is not None
+    return [replace(p, faces={j: f.subset(np.arange(0, len(f), step)) for j, f in p.faces.items()}) for p in places]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -66,7 +66,10 @@ class CornerTruth:
 
 @dataclass(frozen=True)
 class CornerSceneSpec:
-    """What to simulate: `pose` is one of `PAPER_POSES`, or T_world_lidar itself."""
+    """What to simulate: `pose` is one of `PAPER_POSES`, or T_world_lidar itself.
+
+    `beam_crossing_m` is how far before the LiDAR's axis its beams cross, which the clouds leave out.
+    """
 
     pose: str | Pose = "1"
     target: TargetKind | None = None
@@ -82,6 +85,7 @@ class CornerSceneSpec:
     hints: bool = False
     turned_place: int | None = None
     turned_deg: float = 5.0
+    beam_crossing_m: float = 0.0
     defects: Defects = field(default_factory=Defects)
 
 
@@ -250,7 +254,7 @@ def simulate_corner_session(spec: CornerSceneSpec) -> tuple[CornerSession, Corne
     T_world_lidar, kind, ground_m = _resolve(spec)
     ahead = T_world_lidar.rotation[:, 0]
     target = make_target(kind, spec.size_m, float(np.arctan2(ahead[1], ahead[0])) + np.pi, rng)
-    table = INSTRUMENTS[spec.lidar]()
+    table = replace(INSTRUMENTS[spec.lidar](), crossing_m=spec.beam_crossing_m)
     corners = corner_places(spec.places, T_world_lidar, ground_m, target, table, rng)
     surroundings = _surroundings(spec, T_world_lidar.translation, ground_m, corners, rng)
     to_source = _to_source(spec) @ T_world_lidar.inverse()

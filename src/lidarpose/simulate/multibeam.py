@@ -47,12 +47,16 @@ class BeamTable:
         Unit beam directions of one frame in the LiDAR frame, in firing order.
     divergence_rad
         Full width of a beam, for mixed pixels.
+    crossing_m
+        How far before the axis, which is the frame's z, the beams cross: each starts this times the tangent of its
+        elevation below the origin. Recorded points leave that out, as those of some drivers do.
     """
 
     name: str
     directions: FloatArray
     divergence_rad: float
     max_range_m: float
+    crossing_m: float = 0.0
 
 
 def _ring_directions(elevation_deg: FloatArray, azimuth_deg: FloatArray) -> FloatArray:
@@ -130,20 +134,26 @@ def cast_scene(
     spread = rng.normal(0.0, table.divergence_rad / 4.0, table.directions.shape)
     beside = table.directions + spread
     beside /= np.linalg.norm(beside, axis=1, keepdims=True)
-    first, solid = _nearest(solids, T_world_lidar, table.directions)
-    second, _ = _nearest(solids, T_world_lidar, beside)
+    first, solid = _nearest(solids, T_world_lidar, table, table.directions)
+    second, _ = _nearest(solids, T_world_lidar, table, beside)
     return CastScene(table, first, second, solid)
 
 
 def _nearest(
-    solids: Sequence[ConvexSolid], T_world_lidar: Pose, directions: FloatArray
+    solids: Sequence[ConvexSolid], T_world_lidar: Pose, table: BeamTable, directions: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
+    """Ranges (N,) along directions (N, 3), from where the table's beams start, and which solid is met (-1: none)."""
     world = T_world_lidar.rotate(directions)
     best = np.full(len(world), np.inf)
     which = np.full(len(world), -1.0)
-    for index, solid in enumerate(solids):
-        ranges = solid.cast(T_world_lidar.translation, world)
-        nearer = ranges < best
-        best[nearer] = ranges[nearer]
-        which[nearer] = index
+    level = np.maximum(np.hypot(table.directions[:, 0], table.directions[:, 1]), 1e-9)
+    heights, start = np.unique(np.round(-table.crossing_m * table.directions[:, 2] / level, 9), return_inverse=True)
+    for k, height in enumerate(heights):
+        mine = slice(None) if len(heights) == 1 else np.flatnonzero(start == k)
+        origin = T_world_lidar @ np.array([0.0, 0.0, height])
+        for index, solid in enumerate(solids):
+            ranges = solid.cast(origin, world[mine])
+            nearer = ranges < best[mine]
+            best[mine] = np.where(nearer, ranges, best[mine])
+            which[mine] = np.where(nearer, index, which[mine])
     return best, which

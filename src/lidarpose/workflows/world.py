@@ -18,6 +18,7 @@ from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, Fac
 from lidarpose.model.corner_session import CornerSession
 from lidarpose.model.observation import LeftOut
 from lidarpose.model.world_run import WorldRun
+from lidarpose.refine.beam_crossing import SeenCrossing, seen_crossing, without_crossing
 from lidarpose.refine.corner_model import (
     SETTLED,
     CornerFit,
@@ -38,7 +39,7 @@ from lidarpose.refine.corner_verdict import (
     judge_corners,
 )
 from lidarpose.refine.face_rims import without_rims
-from lidarpose.refine.ring_offsets import RingOffsets, find_rings, ring_offsets, rings_seem_off
+from lidarpose.refine.ring_offsets import RingOffsets, Rings, find_rings, ring_offsets, some_returns
 from lidarpose.solve.corner_alignment import cayley_pose, pair_scale, svd_pose
 from lidarpose.solve.corner_matching import face_order
 from lidarpose.workflows.corner_target import (
@@ -69,6 +70,8 @@ FIRST_SETTLED = 0.01
 SMALL_TURN_RAD = np.radians(3.0)
 # Offsets of rings, and how much else spots err together, are estimated in turn.
 RING_STEPS = 3
+# So are a crossing of the beams and the errors of the world's coordinates.
+CROSSING_STEPS = 3
 # Twice the gain in log likelihood at which uncertain world coordinates are believed in.
 CONVINCING_GAIN = 9.0
 
@@ -260,7 +263,7 @@ def _joint(
     places, frame_scatter, dropped = _without_odd_frames(observed, by_frame)
     places = without_rims(places, fit.state.normals, corners, fit.range_sigma_m, _common_error(fit, first, places))
     fit, used = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too)
-    fit, used, offsets = _without_ring_offsets(mended, fit, used)
+    fit, used, offsets, crossing = _without_ring_offsets(mended, fit, used)
     left_out += [
         LeftOut(f"{name}: {n} frames", "their corner, or how much of the faces they show, is far from the others'")
         for name, n in dropped.items()
@@ -276,6 +279,7 @@ def _joint(
         _turns(session, fits, fit, used),
         0.0 if offsets is None else offsets.told,
         {} if offsets is None else offsets.figures,
+        crossing,
     )
     quality = judge_corner_fit(fit, used, evidence, limits)
     calibration = WorldCalibration(
@@ -441,10 +445,54 @@ def _fit(
 
 def _without_ring_offsets(
     session: CornerSession, fit: CornerFit, used: list[CornerPlaceFaces]
+) -> tuple[CornerFit, list[CornerPlaceFaces], RingOffsets | None, SeenCrossing | None]:
+    """The joint estimate beside offsets of a multi-beam LiDAR's rings, where the data speak for any, and where its
+    beams seem to cross."""
+    few = some_returns(used) if session.cloud_frame == "lidar" else []
+    few_rings = find_rings(few)
+    if few_rings is None:
+        return fit, used, None, None
+    estimate, clean, offsets = fit, used, None
+    if ring_offsets(fit, few, few_rings) is not None:
+        estimate, clean, offsets = _with_rings(session, fit, used)
+    crossing = _crossing(session, estimate, clean, few, few_rings, offsets)
+    if crossing is not None and crossing.told:
+        estimate = replace(estimate, covariance=estimate.covariance + np.outer(crossing.move, crossing.move))
+    return estimate, clean, offsets, crossing
+
+
+def _crossing(
+    session: CornerSession,
+    fit: CornerFit,
+    clean: list[CornerPlaceFaces],
+    few: list[CornerPlaceFaces],
+    rings: Rings,
+    offsets: RingOffsets | None,
+) -> SeenCrossing | None:
+    """Where the beams seem to cross, from some returns `few`; `clean` are all, without offsets of rings."""
+    told, ring_sigma_m = (0.0, 0.0) if offsets is None else (offsets.told, offsets.sigma_m)
+    factor = common_error_factor(fit, some_returns(clean), told)
+    first = seen_crossing(fit, few, rings, ring_sigma_m, factor)
+    if first is None or first.told or session.world_sigma_m is not None or not fit.world_sigma_m > 0.0:
+        return first
+    # What a crossing does has passed for errors of the world's coordinates: are there any where it is taken out?
+    total, last = first.crossing_m, first
+    for _ in range(CROSSING_STEPS):
+        taken = without_crossing(clean, fit, total)
+        fit, _ = _fit(session, taken, fit.state, fit.range_sigma_m, "log_scale" in fit.names)
+        factor = common_error_factor(fit, some_returns(taken), told)
+        again = seen_crossing(fit, without_crossing(few, fit, total), rings, ring_sigma_m, factor)
+        if again is None:
+            return first
+        total, last = total + again.crossing_m, again
+    move = first.move * (total / first.crossing_m)
+    estimated = 8.0 if "log_scale" in fit.names else 7.0
+    return SeenCrossing(total, last.sigma_m, move, 3.0 * len(clean) - estimated)
+
+
+def _with_rings(
+    session: CornerSession, fit: CornerFit, used: list[CornerPlaceFaces]
 ) -> tuple[CornerFit, list[CornerPlaceFaces], RingOffsets | None]:
-    """The joint estimate beside offsets of a multi-beam LiDAR's rings, where the data speak for any."""
-    if session.cloud_frame != "lidar" or not rings_seem_off(fit, used):
-        return fit, used, None
     rings = find_rings(used)
     offsets = None if rings is None else ring_offsets(fit, used, rings)
     clean, estimate = used, fit
