@@ -186,6 +186,10 @@ def test_from_a_folder_to_a_straight_room(tmp_path: Path, capsys: pytest.Capture
         (["--axis-beam-deg", "nan"], "finite"),
         (["--axis-beam-deg", "90", "--estimate", "range-scale"], "unknown size"),
         (["--axis-beam-deg", "90", "--method", "paper"], "--method"),
+        (["--axis-beam-deg", "90", "--stops", "--never-stops"], "--stops and --never-stops are given together"),
+        (["--axis-beam-deg", "90", "--axis-beam-deg", "80"], "--axis-beam-deg is given more than once"),
+        (["--axis-beam-deg", "90", "--first-panel", "1"], "is for turntable sessions"),
+        (["--axis-beam-deg", "90", "--estimate-scale"], "is for corner sessions"),
     ],
 )
 def test_wrong_usage_is_named(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -101,59 +102,41 @@ def calibrate(
     """
     from lidarpose.storage.atomic import require_writable_folder
     from lidarpose.storage.recording import is_recording
-    from lidarpose.storage.session import CORNER_SESSION_FORMAT, SESSION_FORMAT, session_format
+    from lidarpose.storage.session import CORNER_SESSION_FORMAT, session_format
 
     require_writable_folder(output)
+    common: dict[str, Any] = {"want_mm": want_mm, "want_deg": want_deg, "report": report, "json": json, "quiet": quiet}
+    of_turntables = {
+        "--first-panel": first_panel is not None,
+        "--any-order": any_order,
+        "--beams-turn": beams_turn is not None,
+        "--table-turns": table_turns is not None,
+    }
+    of_corners = {"--estimate-scale": estimate_scale, "--turntable": turntable is not None}
+    of_recordings = {"--axis-beam-deg": axis_beam_deg is not None, "--start": start is not None}
     if is_recording(session):
-        _calibrate_recording(
-            session,
-            output,
-            method,
-            estimate,
-            axis_beam_deg,
-            start,
-            want_mm,
-            want_deg,
-            never_stops=never_stops,
-            report=report,
-            json=json,
-            quiet=quiet,
-        )
+        _only_for("turntable sessions", of_turntables)
+        _only_for("corner sessions", of_corners)
+        _only_for("sessions", {"--method": method != "joint"}, "nothing: a recording has one method")
+        from lidarpose.cli.calibrate_recording import calibrate_recording
+
+        wanted = {"axis_beam_deg": axis_beam_deg, "start": start, "never_stops": never_stops, "estimate": estimate}
+        calibrate_recording(session, output, **wanted, **common)
         return
     found = session_format(session)
-    if axis_beam_deg is not None or start is not None:
-        option = "--axis-beam-deg" if axis_beam_deg is not None else "--start"
-        raise InputError(option, "is for sweep recordings", expected="a folder with recording.toml")
+    _only_for("sweep recordings", of_recordings, "a folder with recording.toml")
     if found == CORNER_SESSION_FORMAT:
-        _calibrate_corners(
-            session,
-            output,
-            method,
-            estimate_scale,
-            want_mm,
-            want_deg,
-            turntable=turntable,
-            never_stops=bool(never_stops),
-            report=report,
-            json=json,
-            quiet=quiet,
-        )
+        _only_for("turntable sessions", {**of_turntables, "--estimate": bool(estimate)})
+        from lidarpose.cli.calibrate_world import calibrate_world_session
+
+        wanted = {"method": method, "estimate_scale": estimate_scale or None, "turntable": turntable}
+        calibration = calibrate_world_session(session, output, never_stops=never_stops, **wanted, **common)
+        _refuse_if_rejected(calibration.quality)
         return
-    if turntable is not None or never_stops is not None:
-        option = "--never-stops" if turntable is None else "--turntable"
-        raise InputError(option, "is for sweep recordings", expected="a recording, or a corner session with recordings")
-    if found != SESSION_FORMAT:
-        expected = f'"{SESSION_FORMAT}" or "{CORNER_SESSION_FORMAT}"'
-        raise InputError(session / "session.toml", f"is {found!r}", field="format", expected=expected)
-    if method not in ("joint", "paper"):
-        raise InputError("--method", f"{method!r} is for corner sessions", expected="joint or paper")
-    if "beam-angle-offset" in estimate:
-        raise InputError(
-            "--estimate beam-angle-offset",
-            "cannot be told from a turn of the LiDAR about its own z axis, which every estimate contains: adding the "
-            "same angle to all beams and turning the LiDAR back by it gives the same points",
-            remedy="Leave it out: the result is right for beam angles as the scans state them",
-        )
+    _require_turntable_session(session, found, method, estimate)
+    _only_for("corner sessions", of_corners)
+    sweeps = {"--never-stops": never_stops is True, "--stops": never_stops is False}
+    _only_for("sweep recordings", sweeps, "a recording, or a corner session with recordings")
     options = {
         "method": method,
         "first_panel": first_panel,
@@ -168,70 +151,29 @@ def calibrate(
     _finish(run, session, output, with_report=report, json=json, quiet=quiet)
 
 
-def _calibrate_recording(
-    folder: Path,
-    output: Path,
-    method: str,
-    estimate: tuple[str, ...],
-    axis_beam_deg: float | None,
-    start: Path | None,
-    want_mm: float | None,
-    want_deg: float | None,
-    *,
-    never_stops: bool | None,
-    report: bool,
-    json: bool,
-    quiet: bool,
-) -> None:
-    from lidarpose.cli.calibrate_recording import calibrate_recording
-
-    if method != "joint":
-        raise InputError("--method", f"{method!r} is for sessions", expected="nothing: a recording has one method")
-    calibrate_recording(
-        folder,
-        output,
-        axis_beam_deg=axis_beam_deg,
-        start=start,
-        never_stops=never_stops,
-        estimate=estimate,
-        want_mm=want_mm,
-        want_deg=want_deg,
-        report=report,
-        json=json,
-        quiet=quiet,
-    )
+def _only_for(what: str, given: Mapping[str, bool], expected: str | None = None) -> None:
+    """Refuse the first of the options that are given where there is nothing for them."""
+    for option, is_given in given.items():
+        if is_given:
+            raise InputError(option, f"is for {what}", expected=expected, remedy="Leave it out")
 
 
-def _calibrate_corners(
-    session: Path,
-    output: Path,
-    method: str,
-    estimate_scale: bool,
-    want_mm: float | None,
-    want_deg: float | None,
-    *,
-    turntable: Path | None,
-    never_stops: bool,
-    report: bool,
-    json: bool,
-    quiet: bool,
-) -> None:
-    from lidarpose.cli.calibrate_world import calibrate_world_session
+def _require_turntable_session(folder: Path, found: str, method: str, estimate: Sequence[str]) -> None:
+    """Raise InputError for what is no turntable session, and for what none can tell."""
+    from lidarpose.storage.session import CORNER_SESSION_FORMAT, SESSION_FORMAT
 
-    calibration = calibrate_world_session(
-        session,
-        output,
-        method=method,
-        estimate_scale=estimate_scale or None,
-        want_mm=want_mm,
-        want_deg=want_deg,
-        turntable=turntable,
-        never_stops=never_stops,
-        report=report,
-        json=json,
-        quiet=quiet,
-    )
-    _refuse_if_rejected(calibration.quality)
+    if found != SESSION_FORMAT:
+        expected = f'"{SESSION_FORMAT}" or "{CORNER_SESSION_FORMAT}"'
+        raise InputError(folder / "session.toml", f"is {found!r}", field="format", expected=expected)
+    if method not in ("joint", "paper"):
+        raise InputError("--method", f"{method!r} is for corner sessions", expected="joint or paper")
+    if "beam-angle-offset" in estimate:
+        raise InputError(
+            "--estimate beam-angle-offset",
+            "cannot be told from a turn of the LiDAR about its own z axis, which every estimate contains: adding the "
+            "same angle to all beams and turning the LiDAR back by it gives the same points",
+            remedy="Leave it out: the result is right for beam angles as the scans state them",
+        )
 
 
 def _refuse_if_rejected(quality: Quality | None) -> None:

@@ -26,7 +26,7 @@ def calibrate_world_session(
     json: bool = False,
     quiet: bool = False,
     turntable: Path | None = None,
-    never_stops: bool = False,
+    never_stops: bool | None = None,
 ) -> WorldCalibration:
     """Calibrate a corner session and write `output`/calibration.json and `output`/report.html.
 
@@ -51,7 +51,7 @@ def calibrate_world_session(
     turntable
         The calibration of the turntable on which recordings among the clouds were made, in place of the session's own.
     never_stops
-        It turned on during their sweeps.
+        It turned on during their sweeps; False and None: it stood still.
 
     Raises
     ------
@@ -73,8 +73,9 @@ def calibrate_world_session(
     if chosen is None:
         raise InputError("--method", f"is {method!r}", expected="for a corner session: " + ", ".join(WORLD_METHODS))
     session = read_corner_session(session_folder)
-    if (turntable is not None or never_stops) and not session.has_recordings:
-        option = "--never-stops" if turntable is None else "--turntable"
+    if (turntable is not None or never_stops is not None) and not session.has_recordings:
+        stops = "--never-stops" if never_stops else "--stops"
+        option = stops if turntable is None else "--turntable"
         raise InputError(option, "is for sweep recordings", expected="folders of recordings in the column clouds")
     if turntable is not None:
         session = replace(session, turntable=read_turntable_calibration(turntable))
@@ -85,12 +86,12 @@ def calibrate_world_session(
         "want_deg": want_deg,
         "seed": seed,
         "turntable": None if turntable is None else str(turntable),
-        "never_stops": never_stops,
+        "never_stops": bool(never_stops),
     }
     steps = len(session.places) + sum(len(p.clouds) for p in session.places)
     with progress("Reading clouds", steps, quiet=quiet or json) as advance:
         run = world_run(
-            with_scans(session, never_stops=never_stops),
+            with_scans(session, never_stops=bool(never_stops)),
             chosen,
             estimate_scale=estimate_scale,
             wishes={k: v for k, v in (("want_mm", want_mm), ("want_deg", want_deg)) if v is not None},
