@@ -120,8 +120,8 @@ def calibrate(
         _only_for("sessions", {"--method": method != "joint"}, "nothing: a recording has one method")
         from lidarpose.cli.calibrate_recording import calibrate_recording
 
-        wanted = {"axis_beam_deg": axis_beam_deg, "start": start, "never_stops": never_stops, "estimate": estimate}
-        calibrate_recording(session, output, **wanted, **common)
+        mounting: dict[str, Any] = {"axis_beam_deg": axis_beam_deg, "start": start, "estimate": estimate}
+        calibrate_recording(session, output, never_stops=never_stops, **mounting, **common)
         return
     found = session_format(session)
     _only_for("sweep recordings", of_recordings, "a folder with recording.toml")
@@ -129,7 +129,7 @@ def calibrate(
         _only_for("turntable sessions", {**of_turntables, "--estimate": bool(estimate)})
         from lidarpose.cli.calibrate_world import calibrate_world_session
 
-        wanted = {"method": method, "estimate_scale": estimate_scale or None, "turntable": turntable}
+        wanted: dict[str, Any] = {"method": method, "estimate_scale": estimate_scale or None, "turntable": turntable}
         calibration = calibrate_world_session(session, output, never_stops=never_stops, **wanted, **common)
         _refuse_if_rejected(calibration.quality)
         return

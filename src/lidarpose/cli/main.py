@@ -114,12 +114,15 @@ def _usage(error: CycloptsError) -> str:
     """What is wrong with the command line."""
     from cyclopts import RepeatArgumentError
 
-    if isinstance(error, RepeatArgumentError) and error.argument is not None:
-        known = {*error.argument.names, *error.argument.negatives}
-        given = [t for t in dict.fromkeys(error.root_input_tokens or ()) if t.split("=")[0] in known]
+    if isinstance(error, RepeatArgumentError) and error.app is not None:
+        option = error.token.keyword
+        arguments = error.app.assemble_argument_collection()
+        names = next((a.names for a in arguments if option in a.names), (option,))
+        tokens = dict.fromkeys(token.split("=")[0] for token in error.root_input_tokens or ())
+        given = [token for token in tokens if token in names]
         if len(given) > 1:
             return f"{' and '.join(given)} are given together: give one of them"
-        return f"{error.token.keyword} is given more than once"
+        return f"{option} is given more than once"
     return str(error).strip() or "wrong usage"
 
 
