@@ -248,16 +248,14 @@ class FaceMask:
             return self._select_compiled(rays, range_m, gate_m)
         face, predicted, slope = self._meet(rays)
         with np.errstate(invalid="ignore"):
-            chosen = np.flatnonzero(np.abs(range_m - predicted) < gate_m)
-        face, predicted = face[chosen], predicted[chosen]
+            near = np.abs(range_m - predicted) < gate_m
         indices, faces = [], []
         for j in range(3):
-            mine = np.flatnonzero(face == j)
-            on_face = predicted[mine]
-            mine = chosen[mine]
+            mine = np.flatnonzero(near & (face == j))
+            on_face = predicted.take(mine)
             good = self._inside(j, rays.take(mine, axis=1) * on_face, slope.take(mine, axis=1) * on_face)
             indices.append(mine[good])
-            faces.append(np.full(int(np.count_nonzero(good)), j))
+            faces.append(np.full(len(indices[-1]), j))
         return np.concatenate(indices), np.concatenate(faces)
 
     def _select_compiled(self, rays: FloatArray, range_m: FloatArray, gate_m: float) -> tuple[IntArray, IntArray]:
@@ -295,30 +293,30 @@ class FaceMask:
         """How far a face's points have to be from what borders it."""
         return max(float(np.linalg.norm(cross3(self.normals[face], plane.normal))), 0.2) * (2.0 * self.margin_m + 0.01)
 
-    def meet(self, directions: FloatArray) -> tuple[IntArray, FloatArray]:
+    def meet(self, directions: FloatArray) -> tuple[NDArray[np.uint8], FloatArray]:
         """By direction (N, 3): the face met, and the range there; inf where the beam meets none."""
         face, best, _ = self._meet(np.ascontiguousarray(directions.T))
         return face, best
 
-    def _meet(self, rays: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    def _meet(self, rays: FloatArray) -> tuple[NDArray[np.uint8], FloatArray, FloatArray]:
         """By ray (3, N): face and range as `meet` tells them, and the cosines (3, N) to the normals."""
         slope = self.normals @ rays
-        height = self.normals @ self.corner
-        facing = slope < -0.02
+        away = slope >= -0.02
         with np.errstate(divide="ignore"):
-            a, b, c = np.where(facing, height[:, None] / slope, -np.inf if self.convex else np.inf)
+            reach = (self.normals @ self.corner)[:, None] / slope
+        reach[away] = -np.inf if self.convex else np.inf
+        a, b, c = reach
         if self.convex:
-            second = b > a
-            best = np.maximum(a, b)
+            second, best = b > a, np.maximum(a, b)
             third = c > best
+            np.maximum(best, c, out=best)
             # Whoever leaves one of a convex corner's planes behind never enters the solid.
-            best = np.where(facing[0] & facing[1] & facing[2], np.maximum(best, c), np.inf)
+            best[away[0] | away[1] | away[2]] = np.inf
         else:
-            second = b < a
-            best = np.minimum(a, b)
+            second, best = b < a, np.minimum(a, b)
             third = c < best
-            best = np.minimum(best, c)
-        return np.where(third, 2, second).astype(np.int64), best, slope
+            np.minimum(best, c, out=best)
+        return np.where(third, np.uint8(2), second.view(np.uint8)), best, slope
 
     def _inside(self, face: int, on_face: FloatArray, height: FloatArray) -> BoolArray:
         """Which predicted points (3, N) of a face lie in its outline, off its edges with others and off obstacles.

@@ -147,9 +147,13 @@ def face_residuals(returns: FaceReturns, normal: FloatArray, corner: FloatArray)
 def direction_grid(rays: FloatArray, cell_rad: float) -> IntArray:
     """Row and column (2, N), from 0, of rays (3, N) in a grid of angles about the bundle's middle."""
     local = np.linalg.svd(rays.mean(axis=1)[None])[2] @ rays
-    angles = np.arctan(local[1:] / np.maximum(np.abs(local[0]), 1e-12))
-    grid = np.floor(angles / cell_rad).astype(np.int64)
-    return np.asarray(grid - grid.min(axis=1, keepdims=True))
+    angles = local[1:]
+    angles /= np.maximum(np.abs(local[0]), 1e-12)
+    np.arctan(angles, out=angles)
+    angles *= 1.0 / cell_rad
+    angles -= np.floor(angles.min(axis=1, keepdims=True))
+    # Counted from 0 on: what is cut off is the fraction.
+    return np.asarray(angles.astype(np.int64))
 
 
 def direction_cells(rays: FloatArray, cell_rad: float) -> IntArray:

@@ -7,6 +7,7 @@ same, and sooner.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -46,63 +47,79 @@ def without_foreign_spots(
     -------
     All returns where nothing is foreign, or where the face as a whole is turned: that is for the estimate to say.
     """
-    spots = _spots(returns, normal, corner)
+    grid = _Grid.of(returns)
+    spots = None if grid.dense else _spots(returns, grid, normal, corner)
     # Where scan lines lie so close, none is needed outside of the outline to tell where the face ends.
-    if spots.dense or _is_rim_odd(spots.residual[rim], sigma_m, spots.spread_m):
-        returns = returns.subset(np.flatnonzero(~rim))
-        if len(returns) == 0:
-            return returns
-        spots = _spots(returns, normal, corner)
+    if spots is None or _is_rim_odd(spots.residual[rim], sigma_m, spots.spread_m):
+        inner = np.flatnonzero(~rim)
+        if len(inner) == 0:
+            return returns.subset(inner)
+        if len(inner) < len(rim):
+            returns, grid = returns.subset(inner), grid.subset(inner)
+        spots = _spots(returns, grid, normal, corner)
     odd = _odd(spots, sigma_m)
     if not odd.any() or _is_turned(returns, spots, normal, corner, sigma_m):
         return returns
-    if spots.dense:
+    if spots.grid.dense:
         # What is something else does not end where a spot does.
-        odd |= _sum_around(odd, spots.width) > 0
-    return returns.subset(np.flatnonzero(~odd[spots.cell]))
+        odd |= _sum_around(odd, spots.grid.width) > 0
+    return returns.subset(np.flatnonzero(~odd[spots.grid.cell]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Which cell (N,) of a grid of directions each return is in, and how many each cell (M,) holds. The grid has a rim
+    of empty cells, its rows of `width` one after the other."""
+
+    cell: IntArray
+    count: IntArray
+    width: int
+
+    @staticmethod
+    def of(returns: FaceReturns) -> _Grid:
+        row, column = direction_grid(returns.rays, SPOT_RAD)
+        width = int(column.max()) + 3
+        cell = np.asarray((row + 1) * width + column + 1)
+        return _Grid(cell, np.bincount(cell), width)
+
+    def subset(self, index: IntArray) -> _Grid:
+        cell = self.cell[index]
+        return _Grid(cell, np.bincount(cell), self.width)
+
+    @cached_property
+    def dense(self) -> bool:
+        """Whether scan lines lie closer than spots, so that most neighbours of a spot hold returns too."""
+        there = self.count > 0
+        return float(_sum_around(there, self.width)[there].mean()) > DENSE_NEIGHBOURS
 
 
 @dataclass(frozen=True, eq=False)
 class _Spots:
-    """A face's returns in a grid of directions with a rim of empty cells, its rows of `width` one after the other.
+    """What a face's returns are off by, by themselves and cell by cell.
 
     Attributes
     ----------
-    cell, residual : (N,)
-        Of each return; residuals against the level of what is next to the corner.
-    count, mean : (M,)
-        Of each cell: returns, and their mean residual.
+    residual : (N,)
+        Against the level of what is next to the corner.
+    mean : (M,)
+        Of each cell.
     spread_m
         How far spots next to the corner are off, as a standard deviation.
     """
 
-    cell: IntArray
+    grid: _Grid
     residual: FloatArray
-    count: IntArray
     mean: FloatArray
-    width: int
     spread_m: float
 
-    @property
-    def dense(self) -> bool:
-        return _is_dense(self.count, self.width)
 
-
-def _spots(returns: FaceReturns, normal: FloatArray, corner: FloatArray) -> _Spots:
+def _spots(returns: FaceReturns, grid: _Grid, normal: FloatArray, corner: FloatArray) -> _Spots:
     residual = face_residuals(returns, normal, corner)
-    cell, width = _cells(returns)
-    count = np.bincount(cell)
     sure = _next_to_corner(returns, corner)
-    residual -= median(residual[sure])
-    mean = _means(cell, count, residual)
-    spread_m = _spread(mean, count, np.bincount(cell[sure], minlength=len(count)))
-    return _Spots(cell, residual, count, mean, width, spread_m)
-
-
-def _is_dense(count: IntArray, width: int) -> bool:
-    """Whether scan lines lie closer than spots, so that most neighbours of a spot hold returns too."""
-    there = count > 0
-    return float(_sum_around(there, width)[there].mean()) > DENSE_NEIGHBOURS
+    residual -= median(residual.take(sure))
+    mean = _means(grid, residual)
+    spread_m = _spread(mean, grid.count, np.bincount(grid.cell.take(sure), minlength=len(grid.count)))
+    return _Spots(grid, residual, mean, spread_m)
 
 
 def _is_rim_odd(residual: FloatArray, sigma_m: float, spread_m: float) -> bool:
@@ -117,18 +134,11 @@ def _is_turned(returns: FaceReturns, spots: _Spots, normal: FloatArray, corner: 
     """Whether a plane of its own explains a face to the noise: then nothing on it is foreign."""
     _, rows = face_rows(returns.rays, normal, corner)
     own = spots.residual - rows.T @ np.linalg.lstsq(rows.T, spots.residual, rcond=None)[0]
-    return _only_noise(_means(spots.cell, spots.count, own), spots.count, sigma_m)
+    return _only_noise(_means(spots.grid, own), spots.grid.count, sigma_m)
 
 
-def _cells(returns: FaceReturns) -> tuple[IntArray, int]:
-    """The cell (N,) of each return in a grid with a rim of empty cells, and the length of the grid's rows."""
-    row, column = direction_grid(returns.rays, SPOT_RAD)
-    width = int(column.max()) + 3
-    return np.asarray((row + 1) * width + column + 1), width
-
-
-def _means(cell: IntArray, count: IntArray, residual: FloatArray) -> FloatArray:
-    return np.asarray(np.bincount(cell, residual) / np.maximum(count, 1))
+def _means(grid: _Grid, residual: FloatArray) -> FloatArray:
+    return np.asarray(np.bincount(grid.cell, residual) / np.maximum(grid.count, 1))
 
 
 def _next_to_corner(returns: FaceReturns, corner: FloatArray) -> IntArray:
@@ -150,7 +160,7 @@ def _spread(mean: FloatArray, count: IntArray, sure: IntArray) -> float:
 def _odd(spots: _Spots, sigma_m: float) -> BoolArray:
     off = np.abs(spots.mean)
     far = off > max(ODD_SPOT_SIGMAS * sigma_m, ODD_SPREADS * spots.spread_m)
-    return np.asarray(far & (off * np.sqrt(spots.count) > ODD_MEAN_SIGMAS * sigma_m))
+    return np.asarray(far & (off * np.sqrt(spots.grid.count) > ODD_MEAN_SIGMAS * sigma_m))
 
 
 def _only_noise(mean: FloatArray, count: IntArray, sigma_m: float) -> bool:
