@@ -49,7 +49,7 @@ class _Face:
     residual : (N,)
         Measured minus expected range, in standard deviations of a single return.
     place : (N,)
-        Which place each return is of.
+        Which place each return is of, ascending.
     toward : (P, 2), distance_m : (P,)
         Of each place: the unit direction to the corner along the plane's axes, and the distance.
     """
@@ -123,8 +123,7 @@ def _face(
 
 def _sides(face: _Face, seams: FloatArray) -> list[_Side]:
     """The straight sides of a face but those along the lines through 0 across `seams` (2, 2)."""
-    few = _common_part(face)
-    vertices = _vertices(few)
+    few, vertices = _common_part(face)
     edges = np.roll(vertices, -1, axis=0) - vertices
     length = np.linalg.norm(edges, axis=1)
     outward = np.column_stack([edges[:, 1], -edges[:, 0]]) / np.maximum(length, 1e-12)[:, None]
@@ -139,28 +138,24 @@ def _sides(face: _Face, seams: FloatArray) -> list[_Side]:
     return sides
 
 
-def _directions() -> FloatArray:
-    angle = np.linspace(0.0, 2.0 * np.pi, OUTLINE_DIRECTIONS, endpoint=False)
-    return np.stack([np.cos(angle), np.sin(angle)])
-
-
-def _vertices(points: FloatArray) -> FloatArray:
-    """Those of the points (2, N) that are farthest out (V, 2), counter-clockwise."""
-    outermost = np.argmax(points.T @ _directions(), axis=0)
-    return np.asarray(points[:, outermost[outermost != np.roll(outermost, 1)]].T)
-
-
-def _common_part(face: _Face) -> FloatArray:
-    """Some of a face's points (2, N), those no farther out in any direction than half of the places reach.
+def _common_part(face: _Face) -> tuple[FloatArray, FloatArray]:
+    """Some of a face's points (2, N), those no farther out in any direction than half of the places reach; and those of
+    them that are farthest out (V, 2), counter-clockwise.
 
     Where the ground lies 2 cm below a face, a single place may show it as the face's own.
     """
     step = max(len(face.place) // MOST_FOR_OUTLINE, 1)
     points, place = face.points[:, ::step], face.place[::step]
-    out = points.T @ _directions()
-    reach = [out[place == k].max(axis=0) for k in range(len(face.distance_m)) if (place == k).any()]
-    common = (out <= np.median(reach, axis=0) + 1e-9).all(axis=1)
-    return np.asarray(points[:, common] if np.count_nonzero(common) > FEWEST_RETURNS else points)
+    # Half of the directions: the others are their opposites.
+    angle = np.arange(OUTLINE_DIRECTIONS // 2) * (2.0 * np.pi / OUTLINE_DIRECTIONS)
+    out = np.column_stack([np.cos(angle), np.sin(angle)]) @ points
+    begins = np.flatnonzero(np.diff(place, prepend=-1))
+    most, least = (np.median(ends.reduceat(out, begins, axis=1), axis=1) for ends in (np.maximum, np.minimum))
+    common = ((out <= most[:, None] + 1e-9) & (out >= least[:, None] - 1e-9)).all(axis=0)
+    if np.count_nonzero(common) > FEWEST_RETURNS and not common.all():
+        points, out = points.compress(common, axis=1), out.compress(common, axis=1)
+    outermost = np.concatenate([out.argmax(axis=1), out.argmin(axis=1)])
+    return points, np.asarray(points[:, outermost[outermost != np.roll(outermost, 1)]].T)
 
 
 def _inside(face: _Face, sides: Sequence[_Side], step_sigmas: float) -> BoolArray:
@@ -171,25 +166,29 @@ def _inside(face: _Face, sides: Sequence[_Side], step_sigmas: float) -> BoolArra
         across = float(inwards.max())
         if across < THINNEST_M:
             continue
-        inside &= ~_foreign_beyond(face, inwards, step_sigmas)
-        strip = np.flatnonzero((inwards < min(STRIP_M, STRIP_SHARE * across)) & inside)
+        inside[_foreign_beyond(face, inwards, step_sigmas)] = False
+        strip = np.flatnonzero(inwards < min(STRIP_M, STRIP_SHARE * across))
+        strip = strip[inside.take(strip)]
         if len(strip) == 0:
             continue
-        strip = strip[np.argsort(inwards[strip], kind="stable")]
-        sums = np.abs(np.cumsum(face.residual[strip])) / np.sqrt(np.arange(1, len(strip) + 1))
+        strip = strip[np.argsort(inwards.take(strip))]
+        sums = np.abs(np.cumsum(face.residual.take(strip))) / np.sqrt(np.arange(1, len(strip) + 1))
         step = int(np.argmax(sums))
         end = inwards[strip[step if sums[step] > step_sigmas else 0]]
         # A beam's width is stretched where it meets the face at a grazing angle.
         seen = np.sqrt(1.0 - (face.toward @ side.outward) ** 2)
         guard = (GUARD_M + GUARD_RAD * face.distance_m) / np.maximum(seen, MOST_GRAZING)
-        inside &= inwards > end + np.minimum(guard, GUARD_SHARE * across)[face.place]
+        limit = end + np.minimum(guard, GUARD_SHARE * across)
+        outer = np.flatnonzero(inwards <= limit.max())
+        inside[outer[inwards.take(outer) <= limit[face.place.take(outer)]]] = False
     return inside
 
 
-def _foreign_beyond(face: _Face, inwards: FloatArray, step_sigmas: float) -> BoolArray:
-    """Which returns (N,) lie farther out than half of the places reach, at places where these are off the face."""
-    beyond = inwards < 0.0
-    count = np.bincount(face.place[beyond], minlength=len(face.distance_m))
-    total = np.bincount(face.place[beyond], face.residual[beyond], len(face.distance_m))
+def _foreign_beyond(face: _Face, inwards: FloatArray, step_sigmas: float) -> IntArray:
+    """Which returns (M,) lie farther out than half of the places reach, at places where these are off the face."""
+    beyond = np.flatnonzero(inwards < 0.0)
+    place = face.place.take(beyond)
+    count = np.bincount(place, minlength=len(face.distance_m))
+    total = np.bincount(place, face.residual.take(beyond), len(face.distance_m))
     foreign = np.abs(total) > step_sigmas * np.sqrt(np.maximum(count, 1))
-    return np.asarray(beyond & foreign[face.place])
+    return np.asarray(beyond[foreign[place]])
