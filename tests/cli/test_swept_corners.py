@@ -1,6 +1,7 @@
 """Sweeps of a turned 2D LiDAR as frames of a corner session: recordings, scanned into clouds, give world <- camera."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ from lidarpose.cli.main import run
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose, exp_so3
-from lidarpose.storage.calibration import read_world_calibration
+from lidarpose.model.calibration import TurntableCalibration, WorldCalibration
+from lidarpose.model.turntable import TurntableMotion
+from lidarpose.storage.calibration import read_turntable_calibration, read_world_calibration
 from lidarpose.storage.corner_session import read_corner_session
 from lidarpose.workflows.recorded_corners import with_scans
 from lidarpose.workflows.world import world_run
@@ -144,3 +147,43 @@ def test_clouds_beside_recordings_at_one_place_are_refused(recorded: Path) -> No
     finally:
         stray.unlink()
         table.write_text(plain)
+
+
+def bent(motion: TurntableMotion, change: FloatArray) -> TurntableMotion:
+    """The motion with its ten parameters changed (10,)."""
+    mounting = exp_so3(change[7:]) @ motion.T_turntable_lidar.rotation
+    return TurntableMotion(
+        Pose.exp(change[:6]) @ motion.T_camera_turntable,
+        Pose(mounting, np.array([motion.radius_m + change[6], 0.0, 0.0])),
+    )
+
+
+def test_the_turntables_own_covariance_reaches_the_world(recorded: Path) -> None:
+    """Against estimates from clouds that each parameter of the turntable's calibration has bent."""
+    session = read_corner_session(recorded / "session")
+    motion = read_turntable_calibration(recorded / "turntable.json").motion
+    sigma = np.array([1e-3] * 3 + [1e-3] * 3 + [5e-4] + [1e-3] * 3)
+    mixing = np.random.default_rng(3).normal(0.0, 0.3, (10, 10)) + np.eye(10)
+    factor = sigma[:, None] * mixing
+
+    def found(calibration: TurntableCalibration) -> WorldCalibration:
+        return world_run(replace(session, turntable=calibration)).calibration
+
+    plain = found(TurntableCalibration(motion))
+    known = found(TurntableCalibration(motion, factor @ factor.T))
+    assert plain.covariance is not None
+    assert known.covariance is not None
+    np.testing.assert_array_equal(known.T_world_source.matrix, plain.T_world_source.matrix)
+    added = known.covariance - plain.covariance
+    moves = np.column_stack(
+        [
+            found(TurntableCalibration(bent(motion, change))).T_world_source.minus(plain.T_world_source)
+            for change in factor.T
+        ]
+    )
+    expected = moves @ moves.T
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(added / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.08)
+    assert known.quality is not None
+    assert plain.quality is not None
+    assert known.quality.figures["sigma_position_mm"] > 1.5 * plain.quality.figures["sigma_position_mm"]

@@ -35,7 +35,8 @@ class CornerEvidence:
     """What the workflow knows beside the fit.
 
     `rings_told` are the degrees of freedom that offsets of rings have taken from the residuals; `crossing` is where a
-    multi-beam LiDAR's beams seem to cross, None where that was not asked.
+    multi-beam LiDAR's beams seem to cross, None where that was not asked. `further_covariance` (n, n) is of
+    what the residuals cannot tell.
     """
 
     positions: tuple[str, ...]
@@ -49,6 +50,7 @@ class CornerEvidence:
     rings_told: float = 0.0
     further_figures: Mapping[str, Any] = field(default_factory=dict)
     crossing: SeenCrossing | None = None
+    further_covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,10 @@ def judge_corner_fit(
     moves, statistic, known = place_discrepancies(fit)
     # Each place's corner by its own returns, at the common orientation: what the world coordinates are held against.
     corners = fit.state.scale * (fit.state.corners(fit.world) + np.where(known[:, None], moves[:, :3], 0.0))
-    figures = _figures(fit.state.T_world_lidar, fit.pose_covariance * factor, evidence)
+    covariance = fit.covariance * factor
+    if evidence.further_covariance is not None:
+        covariance = covariance + evidence.further_covariance
+    figures = _figures(fit.state.T_world_lidar, covariance[:6, :6], evidence)
     figures |= {
         "range_sigma_mm": 1e3 * fit.range_sigma_m,
         "world_sigma_mm": 1e3 * fit.world_sigma_m,
@@ -97,7 +102,7 @@ def judge_corner_fit(
         **evidence.further_figures,
     }
     if "log_scale" in fit.names:
-        figures["scale_sigma"] = float(np.sqrt(fit.covariance[6, 6] * factor)) * fit.state.scale
+        figures["scale_sigma"] = float(np.sqrt(covariance[6, 6])) * fit.state.scale
     _judge_common(verdict, fit.state.T_world_lidar, fit.world, corners, figures, evidence, limits)
     _judge_turns(verdict, places, moves, statistic, known, evidence)
     _judge_world(verdict, fit, places, evidence)

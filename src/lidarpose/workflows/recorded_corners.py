@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lidarpose.errors import InputError
+from lidarpose.geometry.arrays import FloatArray
+from lidarpose.measure.assemble import readings_between
+from lidarpose.measure.point_sigma import point_shifts, shifting_covariance
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.corner_session import CloudSource, CornerSession, RecordingSource, is_recording
-from lidarpose.workflows.scanning import ScanOptions, assemble_scan
+from lidarpose.workflows.scanning import ScanOptions, assemble_scan, in_true_angles
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +34,29 @@ class ScannedCloud:
         parts = [part.points for part in assemble_scan(self.source.recording(), self.calibration, options)]
         points = np.concatenate(parts) if parts else np.zeros((0, 3), dtype=np.float32)
         return Cloud(points, frame="camera")
+
+    @property
+    def parameter_covariance(self) -> FloatArray | None:
+        """Of those parameters of the calibration that move points; None where it is not known."""
+        return shifting_covariance(self.calibration)
+
+    def shifts(self) -> Callable[[FloatArray], FloatArray]:
+        """How points (n, 3) of the cloud move with the parameters of `parameter_covariance`: (n, 3, p)."""
+        from scipy.spatial import cKDTree
+
+        recording = self.source.recording()
+        options = ScanOptions(never_stops=self.never_stops, intensity=False, indices=True)
+        parts = list(assemble_scan(recording, self.calibration, options))
+        tree = cKDTree(np.concatenate([part.points for part in parts]))
+        index = np.concatenate([p.fields["sweep"].astype(np.int64) * recording.beams + p.fields["beam"] for p in parts])
+        if self.never_stops and not recording.has_reading_per_beam:
+            recording = replace(recording, turntable_angle_deg=readings_between(recording))
+        recording = in_true_angles(recording, self.calibration)
+
+        def moved(points: FloatArray) -> FloatArray:
+            return point_shifts(points, index[tree.query(points)[1]], recording, self.calibration)
+
+        return moved
 
 
 def with_scans(session: CornerSession, *, never_stops: bool = False) -> CornerSession:

@@ -53,6 +53,7 @@ from lidarpose.workflows.corner_target import (
 )
 from lidarpose.workflows.recorded_corners import with_scans
 from lidarpose.workflows.thin_face import with_thin_face
+from lidarpose.workflows.turntable_share import turntable_share
 from lidarpose.workflows.world_evidence import corners_run, joint_run
 
 WorldMethod = Literal["joint", "paper", "paper-approx", "ransac", "harris"]
@@ -268,6 +269,7 @@ def _joint(
         LeftOut(f"{name}: {n} frames", "their corner, or how much of the faces they show, is far from the others'")
         for name, n in dropped.items()
     ]
+    share = turntable_share(session, fit, used)
     evidence = CornerEvidence(
         tuple(p.position for p in used),
         tuple(left_out),
@@ -280,15 +282,19 @@ def _joint(
         0.0 if offsets is None else offsets.told,
         {} if offsets is None else offsets.figures,
         crossing,
+        None if share is None else share.covariance,
     )
     quality = judge_corner_fit(fit, used, evidence, limits)
+    covariance = fit.covariance * float(quality.figures["covariance_factor"])
+    if share is not None:
+        covariance = covariance + share.covariance
     calibration = WorldCalibration(
         fit.state.T_world_lidar,
         session.cloud_frame,
         fit.state.scale,
-        _as_used(fit.pose_covariance, quality.figures),
+        covariance[:6, :6],
         fit.names,
-        _as_used(fit.covariance, quality.figures),
+        covariance,
         quality,
         _provenance(session, "joint"),
     )
@@ -324,11 +330,6 @@ def _turns(
         if turn is not None:
             turns[place.position] = turn if turn[0] > SMALL_TURN_RAD else small.get(place.position, turn)
     return turns
-
-
-def _as_used(covariance: FloatArray, figures: Mapping[str, Any]) -> FloatArray:
-    """The covariance, widened where returns of one spot err together."""
-    return np.asarray(covariance * float(figures.get("covariance_factor", 1.0)))
 
 
 def _provenance(session: CornerSession, method: str) -> dict[str, Any]:
