@@ -17,7 +17,7 @@ ridge's maxima of each column or row, and the straight line that most of them su
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,18 +80,23 @@ class StripeFinder:
         """Stripe points on every panel in an image of the same size as the bright ones (ValueError if not)."""
         return self.find_in([image])[0]
 
-    def find_in(self, images: Sequence[GrayImage]) -> list[StripeDetection]:
-        """The same for several images at once, which takes a fraction of the time."""
+    def find_in(self, images: Iterable[GrayImage]) -> list[StripeDetection]:
+        """The same for several images at once, which takes a fraction of the time.
+
+        If they are loaded one by one, each is looked at while it is in the cache.
+        """
+        held: list[GrayImage] = []
+        lines: list[list[CoarseLine | str]] = []
         for image in images:
             if image.shape != self._shape:
                 raise ValueError(f"the stripe image has {image.shape} pixels, the bright images have {self._shape}")
-        pays(_SAVED_S_PER_STRIPE * len(images) * len(self._views), KERNELS)  # what follows asks again, for nothing more
-        stripes: list[dict[int, StripePoints]] = [{} for _ in images]
-        problems: list[list[LeftOut]] = [[] for _ in images]
-        # All panels of an image in turn, while it is in the cache.
-        lines = [[find_line(view, image) for view in self._views] for image in images]
+            pays(_SAVED_S_PER_STRIPE * len(self._views), KERNELS)  # what follows asks again, for nothing more
+            held.append(image)
+            lines.append([find_line(view, image) for view in self._views])
+        stripes: list[dict[int, StripePoints]] = [{} for _ in held]
+        problems: list[list[LeftOut]] = [[] for _ in held]
         for k, view in enumerate(self._views):
-            for i, fit in enumerate(_fits(view, images, [found[k] for found in lines], self._limit)):
+            for i, fit in enumerate(_fits(view, held, [found[k] for found in lines], self._limit)):
                 if isinstance(fit, str):
                     problems[i].append(LeftOut(f"stripe on panel {k + 1}", fit))
                 else:

@@ -121,8 +121,7 @@ def usable_ranges(view: PanelView, lines: Sequence[CoarseLine], curves: Curves) 
     v = curves.at(u)
     usable = (u <= last[:, None]) & (v > view.low[across] + 3) & (v < view.high[across] - 4)
     at = np.nonzero(usable)
-    grid, _ = view.grid_and_slopes(as_pixels(u[at], v[at], steep))
-    usable[at] = view.albedo.is_usable(grid)
+    usable[at] = view.albedo.is_usable(view.grid_at(as_pixels(u[at], v[at], steep)))
     # Usable ones to the front of each row; what fills it up repeats the first.
     count = usable.sum(axis=1)
     order = np.argsort(~usable, axis=1, kind="stable")[:, : max(int(count.max()), 1)]

@@ -73,6 +73,11 @@ class PanelView:
     slopes: FloatArray
 
     @cached_property
+    def inner(self) -> IntArray:
+        """`light` and `dark`, one after the other."""
+        return np.concatenate([self.light, self.dark])
+
+    @cached_property
     def nodes_and_slopes(self) -> FloatArray:
         """Both, one row (h * w, 6) a node."""
         return np.concatenate([self.nodes, self.slopes], axis=-1).reshape(-1, 6)
@@ -116,8 +121,22 @@ class PanelView:
             return np.asarray(stripe_kernels.block_means(image, self.low, self.high, self.factor))
         return reduce_image(image[self.low[1] : self.high[1], self.low[0] : self.high[0]], self.factor)
 
+    @cached_property
+    def template(self) -> Template:
+        """The bright image, reduced, as what stripe images are compared with."""
+        return Template.of(self, self.small_bright)
+
+    def grid_at(self, pixels: FloatArray) -> FloatArray:
+        """Grid coordinates (..., 2) at pixels (..., 2)."""
+        return self._at(self.nodes.reshape(-1, 2), pixels)
+
     def grid_and_slopes(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Grid coordinates (..., 2) at pixels (..., 2), and their derivatives (..., 4) as in `slopes`."""
+        found = self._at(self.nodes_and_slopes, pixels)
+        return found[..., :2], found[..., 2:]
+
+    def _at(self, table: FloatArray, pixels: FloatArray) -> FloatArray:
+        """Values (..., k) at pixels (..., 2) of a table with one row (k,) a node."""
         # By hand: remap rounds to 1/32 of a node's distance, which is a quarter of a pixel.
         column, row = ((pixels[..., k] - self.low[k]) / NODE_STEP for k in (0, 1))
         height, width = self.nodes.shape[:2]
@@ -125,11 +144,9 @@ class PanelView:
         j = np.clip(row.astype(np.intp), 0, height - 2)
         x, y = (column - i).astype(np.float32)[..., None], (row - j).astype(np.float32)[..., None]
         first = j * width + i
-        table = self.nodes_and_slopes
         upper = table.take(first, axis=0) * (1 - x) + table.take(first + 1, axis=0) * x
         lower = table.take(first + width, axis=0) * (1 - x) + table.take(first + width + 1, axis=0) * x
-        found = upper * (1 - y) + lower * y
-        return found[..., :2], found[..., 2:]
+        return np.asarray(upper * (1 - y) + lower * y)
 
     def with_model(self) -> PanelView:
         """The same with the bright image as squares, levels and blur make it: without what else there is in it.
@@ -158,6 +175,30 @@ class PanelView:
         share = self.albedo.light_share(grid[..., 0], grid[..., 1], edges[0], edges[1])
         light, dark = self.albedo.levels(grid)
         return np.asarray(dark + (light - dark) * share, dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """A reduced image that others are compared with: median level of its light and of its dark squares, what a tenth
+    and eight tenths of the pixels inside squares are below, and these pixels less their mean, of length 1."""
+
+    image: FloatArray
+    light: float
+    dark: float
+    low: float
+    high: float
+    shape: FloatArray
+
+    @staticmethod
+    def of(view: PanelView, image: FloatArray) -> Template:
+        flat = image.ravel()
+        light, dark = (median(flat[index]) if len(index) else 0.0 for index in (view.light, view.dark))
+        if len(view.inner) < 10:
+            return Template(image, light, dark, 0.0, 0.0, np.zeros(0))
+        shape = flat[view.inner].astype(np.float64)
+        shape -= shape.mean()
+        shape /= max(float(np.sqrt((shape * shape).sum())), 1e-12)
+        return Template(image, light, dark, *_low_and_high(flat[view.inner]), shape)
 
 
 def _usable_pixels(albedo: PanelAlbedo, grid: FloatArray) -> BoolArray:
@@ -230,23 +271,23 @@ class CoarseLine:
 
 def find_line(view: PanelView, image: GrayImage) -> CoarseLine | str:
     """The one line of light on the panel, or why there is none, in words."""
-    small = view.reduced(image)
-    return _find_in_reduced(view, small, view.small_bright)
+    return _find_in_reduced(view, view.reduced(image), view.template)
 
 
 def has_line(view: PanelView) -> bool:
     """Whether the bright image itself has a line of light on the panel: a stripe that must not pass for albedo."""
     squares = view.without_margin()
     contrast = median(view.albedo.light - view.albedo.dark)
-    found = _find_in_reduced(squares, squares.small_bright, squares.small_model(), _MISFIT * contrast)
+    model = Template.of(squares, squares.small_model())
+    found = _find_in_reduced(squares, squares.small_bright, model, _MISFIT * contrast)
     return not isinstance(found, str) or found == _TWO_LINES
 
 
-def _find_in_reduced(view: PanelView, small: FloatArray, template: FloatArray, least: float = 1.5) -> CoarseLine | str:
+def _find_in_reduced(view: PanelView, small: FloatArray, template: Template, least: float = 1.5) -> CoarseLine | str:
     share, offset = _ambient(view, small, template)
     if _is_elsewhere(view, small, template):
         return "the board is not where the bright images show it: it or the camera was moved"
-    rest, ridges = _rest_and_ridges(view, small, template, share, offset)
+    rest, ridges = _rest_and_ridges(view, small, template.image, share, offset)
     threshold = max(6.0 * _noise(view, ridges), least)
     first = _best_line(ridges, threshold)
     if first is None:
@@ -289,20 +330,26 @@ def _sharpness(field: FloatArray, line: _SmallLine) -> float:
     return median(half) / max(median(full), 1e-6)
 
 
-def _is_elsewhere(view: PanelView, small: FloatArray, template: FloatArray) -> bool:
+def _is_elsewhere(view: PanelView, small: FloatArray, template: Template) -> bool:
     """Whether the image is lit, but shows other squares than these."""
-    inner = np.concatenate([view.light, view.dark])
-    if len(inner) < 10:
+    if len(view.inner) < 10:
         return False
-    seen, expected = small.ravel()[inner], template.ravel()[inner]
-    tenth, eighth = len(inner) // 10, 8 * len(inner) // 10
-    low, high = np.partition(seen, (tenth, eighth))[[tenth, eighth]]
-    dark, light = np.partition(expected, (tenth, eighth))[[tenth, eighth]]
-    if high - low < _LIT_SHARE * (light - dark):
+    seen = small.ravel()[view.inner]
+    low, high = _low_and_high(seen)
+    if high - low < _LIT_SHARE * (template.high - template.low):
         return False
     # Clipped: a glare or the stripe itself must not decide.
-    correlation = np.corrcoef(np.clip(seen, low, high), expected)[0, 1]
+    clipped = np.clip(seen, low, high).astype(np.float64)
+    clipped -= clipped.mean()
+    correlation = (clipped * template.shape).sum() / max(float(np.sqrt((clipped * clipped).sum())), 1e-12)
     return bool(correlation < _LEAST_CORRELATION)
+
+
+def _low_and_high(values: FloatArray) -> tuple[float, float]:
+    """What a tenth, and eight tenths, of the values are below."""
+    tenth, eighth = len(values) // 10, 8 * len(values) // 10
+    low, high = np.partition(values, (tenth, eighth))[[tenth, eighth]]
+    return float(low), float(high)
 
 
 def _ridge(field: FloatArray) -> FloatArray:
@@ -324,15 +371,13 @@ class _SmallLine:
     level: float
 
 
-def _ambient(view: PanelView, small: FloatArray, template: FloatArray) -> tuple[float, float]:
+def _ambient(view: PanelView, small: FloatArray, template: Template) -> tuple[float, float]:
     """The light of the bright image (`template`) that is in this one too: a share of it, and a level beside."""
     if len(view.light) == 0 or len(view.dark) == 0:
         return 0.0, 0.0
-    light, dark, bright_light, bright_dark = (
-        median(field.ravel()[index]) for field in (small, template) for index in (view.light, view.dark)
-    )
-    share = max((light - dark) / max(bright_light - bright_dark, 1.0), 0.0)
-    return share, dark - share * bright_dark
+    light, dark = (median(small.ravel()[index]) for index in (view.light, view.dark))
+    share = max((light - dark) / max(template.light - template.dark, 1.0), 0.0)
+    return share, dark - share * template.dark
 
 
 def _rest_and_ridges(
@@ -357,11 +402,10 @@ def _rest_and_ridges(
 
 def _noise(view: PanelView, ridges: tuple[FloatArray, FloatArray]) -> float:
     """Standard deviation of what stands out by chance, from pixels inside the squares."""
-    inner = np.concatenate([view.light, view.dark])
-    if len(inner) == 0:
+    if len(view.inner) == 0:
         return 0.0
     # The smaller of two differences is below zero on average; its spread is what counts.
-    values = ridges[0].ravel()[inner]
+    values = ridges[0].ravel()[view.inner]
     return 1.4826 * median(np.abs(values - median(values)))
 
 

@@ -47,7 +47,7 @@ Batch = Sequence[TurntablePlace]
 _Stripes = tuple[Mapping[int, StripePoints], list[LeftOut]]
 _Detected = tuple[Mapping[str, "BoardDetection"], Sequence[tuple[ScanLine, ...] | LeftOut], Sequence[_Stripes]]
 
-IMAGES_AT_ONCE = 8
+IMAGES_AT_ONCE = 12
 """Most stripe images that are fitted together: enough that single ones cost little, few for memory and progress."""
 
 BATCHES_AHEAD = 4
@@ -299,7 +299,7 @@ def _detect_alone(
         lines = [_find_scan_lines(session, place) for batch in batches for place in batch]
         stripes: list[_Stripes] = []
         for batch in batches:
-            images = [None if image is None else image.result() for image in next(decoded)]
+            images = (image.result() for image in next(decoded) if image is not None)
             stripes += _find_stripes(finders[batch[0].placement], batch, images)
             _advance(step, batch)
     finally:
@@ -325,7 +325,8 @@ def _detect_with_copies(
     boards, finders = found[0]
 
     def search(k: int) -> list[_Stripes]:
-        images = [None if place.stripe_image is None else place.stripe_image.load() for place in batches[k]]
+        # One image after the other, as each is asked for.
+        images = (place.stripe_image.load() for place in batches[k] if place.stripe_image is not None)
         return _find_stripes(finders[batches[k][0].placement], batches[k], images)
 
     stripes = share(search, len(batches), copies=copies, first=meanwhile, done=lambda k: _advance(step, batches[k]))
@@ -402,13 +403,13 @@ def _batches(places: Sequence[TurntablePlace]) -> list[Batch]:
 
 
 def _find_stripes(
-    finder: StripeFinder, places: Sequence[TurntablePlace], images: Sequence[GrayImage | None]
+    finder: StripeFinder, places: Sequence[TurntablePlace], images: Iterable[GrayImage]
 ) -> list[_Stripes]:
-    """Stripes of each place by panel, and what was given up."""
-    detections = iter(finder.find_in([image for image in images if image is not None]))
+    """Stripes of each place by panel, and what was given up; `images` are of those places that have one."""
+    detections = iter(finder.find_in(images))
     found: list[_Stripes] = []
-    for place, image in zip(places, images, strict=True):
-        if image is None:
+    for place in places:
+        if place.stripe_image is None:
             found.append(({}, []))
             continue
         detection = next(detections)
