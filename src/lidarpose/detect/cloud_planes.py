@@ -38,8 +38,8 @@ Bits = NDArray[np.uint64]
 
 KERNELS = "detect.patch_kernels"
 # By how much they search a cloud sooner: its subsamples, and all points where a cloud is searched whole.
-SAVED_S = 3e-3
-SAVED_S_PER_POINT = 1e-7
+SAVED_S = 1.5e-3
+SAVED_S_PER_POINT = 7e-8
 SAMPLE_SIZE = 4096
 PLANES_AT_ONCE = 16
 # From this many points on, patches are found and tested in a subsample, and the whole cloud is asked once.
