@@ -101,7 +101,7 @@ def calibrate(
         Write report.html too.
     """
     from lidarpose.storage.atomic import require_writable_folder
-    from lidarpose.storage.recording import is_recording
+    from lidarpose.storage.recording_head import is_recording
     from lidarpose.storage.session import CORNER_SESSION_FORMAT, session_format
 
     require_writable_folder(output)
@@ -185,7 +185,6 @@ def _refuse_if_rejected(quality: Quality | None) -> None:
 def _calibrate_turntable(folder: Path, options: dict[str, Any], *, with_report: bool, quiet: bool) -> TurntableRun:
     from lidarpose.cli.console import progress
     from lidarpose.refine.joint_options import JointOptions
-    from lidarpose.storage.provenance import provenance
     from lidarpose.storage.session import read_turntable_session, session_files
     from lidarpose.workflows.turntable import calibrate_turntable
 
@@ -193,6 +192,8 @@ def _calibrate_turntable(folder: Path, options: dict[str, Any], *, with_report: 
     first_panel = options["first_panel"]
 
     def record() -> dict[str, Any]:
+        from lidarpose.storage.provenance import provenance
+
         _import_what_follows(with_report=with_report)
         return provenance("calibrate", folder, session_files(folder, session), options)
 
@@ -212,7 +213,8 @@ def _calibrate_turntable(folder: Path, options: dict[str, Any], *, with_report: 
 def _import_what_follows(*, with_report: bool) -> None:
     """Modules that are needed when the calibration is there, while other processes are still searching images."""
     report = ("lidarpose.report.turntable_page",) if with_report else ()
-    for name in ("lidarpose.cli.turntable_summary", "rich.console", "rich.table", *report):
+    files = ("lidarpose.storage.calibration", "lidarpose.storage.truth")
+    for name in ("lidarpose.cli.turntable_summary", "rich.console", "rich.table", *files, *report):
         import_module(name)
 
 

@@ -43,7 +43,7 @@ def inspect(
     table_turns
         The same for the turntable as its readings grow.
     """
-    from lidarpose.storage.recording import is_recording
+    from lidarpose.storage.recording_head import is_recording
     from lidarpose.storage.session import CORNER_SESSION_FORMAT, SESSION_FORMAT, session_format
 
     if is_recording(session):

@@ -24,7 +24,8 @@ from lidarpose.storage.calibration import read_calibration, read_turntable_calib
 from lidarpose.storage.documents import Schema, check_format, parse, read_toml, shown
 from lidarpose.storage.limits import find_files
 from lidarpose.storage.provenance import provenance
-from lidarpose.storage.recording import HEAD, is_recording, recording_files
+from lidarpose.storage.recording import recording_files
+from lidarpose.storage.recording_head import HEAD, is_recording
 from lidarpose.storage.session import CORNER_SESSION_FORMAT, LidarSection, inside
 from lidarpose.storage.session_folder import check_free
 from lidarpose.storage.tables import TextTable, read_text_table

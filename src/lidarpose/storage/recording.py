@@ -20,12 +20,12 @@ from lidarpose.storage.atomic import replacing_folder, restore_folder, write_tex
 from lidarpose.storage.calibration import transform_entry, write_calibration
 from lidarpose.storage.documents import Schema, check_format, parse, read_toml
 from lidarpose.storage.npy_header import read_npy_header
+from lidarpose.storage.recording_head import HEAD
 from lidarpose.storage.session import LidarSection
 from lidarpose.storage.session_folder import check_free
 from lidarpose.storage.truth import truth_path
 
 FORMAT = "lidarpose/sweep-recording@1"
-HEAD = "recording.toml"
 
 _ARRAYS = ("turntable_angle_deg", "beam_angle_deg", "range_m", "intensity", "time_s")
 _FILES = {HEAD, *(f"{name}.npy" for name in _ARRAYS)}
@@ -38,11 +38,6 @@ _LARGEST_RANGE_M = 2000.0
 class _HeadFile(Schema):
     format: Literal["lidarpose/sweep-recording@1"]
     lidar: LidarSection = LidarSection()
-
-
-def is_recording(path: Path) -> bool:
-    """True for a folder with a recording's head file in it."""
-    return (Path(path) / HEAD).is_file()
 
 
 def recording_files(folder: Path) -> list[Path]:

@@ -6,6 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import chain, groupby
@@ -266,10 +267,8 @@ def detect_features(
     if copies == 0:
         found = _detect_alone(session, batches, step, meanwhile)
     else:
-        from lidarpose.detect.opencv_threads import one_opencv_thread
-
-        with one_opencv_thread():
-            found = _detect_with_copies(session, batches, copies, step, meanwhile)
+        with ExitStack() as stack:
+            found = _detect_with_copies(session, batches, copies, step, meanwhile, stack)
     boards, all_lines, all_stripes = found
     places: list[PlaceFeatures] = []
     left_out: list[LeftOut] = []
@@ -313,14 +312,25 @@ def _detect_with_copies(
     copies: int,
     step: Step | None,
     meanwhile: Callable[[], object],
+    stack: ExitStack,
 ) -> _Detected:
-    """The same with the help of forked copies: scans while the boards are found, then images."""
+    """The same with the help of forked copies: scans while the boards are found, then images.
+
+    OpenCV is imported once the first copies, which do not need it, have begun; until `stack` ends it has no threads.
+    """
     found: list[tuple[Mapping[str, BoardDetection], Mapping[str, StripeFinder]]] = []
+
+    def find_boards() -> None:
+        from lidarpose.detect.opencv_threads import one_opencv_thread
+
+        stack.enter_context(one_opencv_thread())
+        found.append(_detect_boards(session))
+
     lines = share(
         lambda k: [_find_scan_lines(session, place) for place in batches[k]],
         len(batches),
         copies=copies,
-        first=lambda: found.append(_detect_boards(session)),
+        first=find_boards,
     )
     boards, finders = found[0]
 
