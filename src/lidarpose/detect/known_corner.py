@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarpose.detect.cloud_planes import PlaneSearch, largest_component, segment_planes
+from lidarpose.detect.crop import inside_box
+from lidarpose.detect.plane_raster import mean_and_covariance
 from lidarpose.detect.trihedral_corner import FaceMask, corner_of_faces, in_outline
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
@@ -28,6 +30,8 @@ MARGIN_M = 0.01
 FIT_STEPS = 3
 # What lies about the target beyond its faces, for the planes that border it.
 AROUND_M = 0.15
+# The same, and the rest of its faces, where its outlines show but a part of them.
+MISSING_M = 0.35
 STANDING_ROUNDS, STANDING_HYPOTHESES, STANDING_VOXEL_M = 2, 150, 0.04
 VOXEL_KEY = np.array([1, 1 << 20, 1 << 40])
 
@@ -82,7 +86,11 @@ def sight_again(
     faces is not there, or most of the beams towards it end elsewhere.
     """
     planes, rest = [], []
-    for local, corner in zip(places, corners, strict=True):
+    close = [
+        _about(p, reference, c, AROUND_M if part_at is None else MISSING_M)
+        for p, c in zip(places, corners, strict=True)
+    ]
+    for local, corner in zip(close, corners, strict=True):
         here = _planes(local, reference, corner)
         if here is None:
             return None
@@ -91,7 +99,7 @@ def sight_again(
         rest.append(local[off > GATE_SIGMAS * reference.sigma_m])
     standing = _standing_planes(np.concatenate(rest), seed)
     if part_at is not None:
-        whole = _whole(places[part_at], planes[part_at], standing, reference)
+        whole = _whole(close[part_at], planes[part_at], standing, reference)
         if whole is None:
             return None
         reference = whole
@@ -133,8 +141,9 @@ def _sighting(
     reference: CornerCandidate,
     corner: FloatArray,
 ) -> CornerCandidate | None:
-    columns = np.ascontiguousarray(local.T)
     own = _meeting(planes)
+    everything, local = local, _about(local, reference, own, AROUND_M)
+    columns = np.ascontiguousarray(local.T)
     faces = [(plane, _over_outline(columns, reference, k, own, BORDER_M)[0]) for k, plane in enumerate(planes)]
     patches = _shared_out(local, faces, standing, reference.sigma_m)
     if min(len(patch) for patch in patches[:3]) < FEWEST:
@@ -143,7 +152,13 @@ def _sighting(
     found = corner_of_faces(local, (*patches[:3], *bordering))
     if found is None or found.convex != reference.convex or np.linalg.norm(found.corner - corner) > NEAR_M:
         return None
-    return found if _is_in_view(local, found, reference) else None
+    return found if _is_in_view(everything, found, reference) else None
+
+
+def _about(points: FloatArray, reference: CornerCandidate, corner: FloatArray, margin_m: float) -> FloatArray:
+    """The points (M, 3) of (N, 3) in the box about the reference's outlines, were the target's corner here."""
+    outlines = np.concatenate(reference.outlines) + (corner - reference.corner)
+    return np.asarray(inside_box(points, outlines.min(axis=0) - margin_m, outlines.max(axis=0) + margin_m))
 
 
 def _meeting(planes: Sequence[Plane]) -> FloatArray:
@@ -192,12 +207,11 @@ def _over_outline(
 def _fitted(local: FloatArray, chosen: IntArray, plane: Plane, sigma_m: float) -> Plane | None:
     members = local[chosen]
     for _ in range(FIT_STEPS):
-        inside = members[np.abs(plane.distance(members)) < GATE_SIGMAS * sigma_m]
+        inside = members.take(np.flatnonzero(np.abs(plane.distance(members)) < GATE_SIGMAS * sigma_m), axis=0)
         if len(inside) < FEWEST:
             return None
-        mean = inside.mean(axis=0)
-        d = inside - mean
-        values, axes = np.linalg.eigh(d.T @ d)
+        mean, covariance = mean_and_covariance(inside)
+        values, axes = np.linalg.eigh(covariance)
         if values[1] < 4.0 * values[0]:
             return None
         normal = axes[:, 0] if axes[:, 0] @ plane.normal > 0.0 else -axes[:, 0]

@@ -181,10 +181,10 @@ def convex_outline(points: FloatArray, plane: Plane) -> FloatArray:
     Its vertices are the points farthest out in `OUTLINE_DIRECTIONS` directions.
     """
     u, v = perpendicular_pair(plane.normal)
-    flat = np.column_stack([points @ u, points @ v])
     angle = np.linspace(0.0, 2.0 * np.pi, OUTLINE_DIRECTIONS, endpoint=False)
-    farthest = np.argmax(flat @ np.stack([np.cos(angle), np.sin(angle)]), axis=0)
-    corners = farthest[farthest != np.roll(farthest, 1)]
+    out = (np.column_stack([np.cos(angle), np.sin(angle)]) @ np.stack([u, v])) @ points.T
+    farthest = np.argmax(out, axis=1)
+    corners = farthest[farthest != np.append(farthest[-1], farthest[:-1])]
     return plane.project(points[corners])
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, unit
+from lidarpose.geometry.threads import each
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.refine.corner_model import tangents
 
@@ -89,22 +90,31 @@ def without_rims(
     common_error
         By how much spots' means scatter more than the noise allows, in squares.
     """
-    kept = [dict(p.faces) for p in places]
-    for j in range(3):
-        rows = [i for i, p in enumerate(places) if j in p.faces]
-        if not rows:
-            continue
+    rows = [[i for i, p in enumerate(places) if j in p.faces] for j in range(3)]
+
+    def of_face(j: int) -> list[FaceReturns | None]:
         axes = tangents(normals[j]).T
-        face = _face([places[i].faces[j] for i in rows], normals[j], axes, corners[rows], sigma_m)
+        returns = [places[i].faces[j] for i in rows[j]]
+        face = _face(returns, normals[j], axes, corners[rows[j]], sigma_m)
         seams = unit(np.stack([axes @ normals[k] for k in range(3) if k != j]))
         inside = _inside(face, _sides(face, seams), STEP_SIGMAS * np.sqrt(common_error))
-        for k, i in enumerate(rows):
-            mine = inside[face.place == k]
-            if np.count_nonzero(mine) < FEWEST_RETURNS:
-                del kept[i][j]
-            elif not mine.all():
-                kept[i][j] = kept[i][j].subset(np.flatnonzero(mine))
+        ends = np.cumsum([len(f) for f in returns])
+        return [_kept(f, mine) for f, mine in zip(returns, np.split(inside, ends[:-1]), strict=True)]
+
+    seen = [j for j in range(3) if rows[j]]
+    kept: list[dict[int, FaceReturns]] = [{} for _ in places]
+    for j, faces in zip(seen, each(of_face, seen, sum(len(f) for p in places for f in p.faces.values())), strict=True):
+        for i, returns in zip(rows[j], faces, strict=True):
+            if returns is not None:
+                kept[i][j] = returns
     return [replace(p, faces=k) for p, k in zip(places, kept, strict=True)]
+
+
+def _kept(returns: FaceReturns, mine: BoolArray) -> FaceReturns | None:
+    count = np.count_nonzero(mine)
+    if count < FEWEST_RETURNS:
+        return None
+    return returns if count == len(mine) else returns.subset(np.flatnonzero(mine))
 
 
 def _face(

@@ -16,6 +16,7 @@ from lidarpose.detect.edge_corner import find_edge_corners
 from lidarpose.detect.trihedral_corner import FaceMask, find_corners
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.geometry.threads import each
 from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import NEAR_RADIUS_M, CornerPlace, CornerSession, look_at_points
 from lidarpose.model.observation import LeftOut
@@ -455,11 +456,15 @@ def observe(
     """Returns of the faces at each place, selected by common normals; what is left out, and why."""
     places, left_out = [], []
     reference = max((s for s in found.sightings if s is not None), key=lambda s: s.support)
-    for k, (place, sighting, crop, corner) in enumerate(
-        zip(session.places, found.sightings, crops, corners, strict=True)
-    ):
+
+    def select(task: tuple[CornerCandidate | None, PlaceCrop, FloatArray]) -> dict[int, FaceReturns]:
+        sighting, crop, corner = task
         mask = mask_of(sighting or reference, corner, normals)
-        faces = select_faces(crop, mask, GATE_SIGMAS * sigma_m, sigma_m)
+        return select_faces(crop, mask, GATE_SIGMAS * sigma_m, sigma_m)
+
+    tasks = list(zip(found.sightings, crops, corners, strict=True))
+    selected = each(select, tasks, max(len(crop.frame) for crop in crops))
+    for k, (place, (sighting, crop, corner), faces) in enumerate(zip(session.places, tasks, selected, strict=True)):
         if k in found.strays:
             faces = {}
         elif sighting is None:

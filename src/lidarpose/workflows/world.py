@@ -13,6 +13,7 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.robust import box_plot_inliers
 from lidarpose.geometry.se3 import Pose
+from lidarpose.geometry.threads import each
 from lidarpose.model.calibration import WorldCalibration
 from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import CornerSession
@@ -256,11 +257,7 @@ def _joint(
     # Then from all, with the faces' beams selected by the estimate itself.
     corners = _expected(fit, places, found.world)
     observed, left_out = observe(mended, found, crops, corners, fit.state.normals, fit.range_sigma_m)
-    by_frame = {
-        p.position: frame_corners(p.faces, fit.state.normals, corner, p.frames, fit.range_sigma_m)
-        for p, corner in zip(observed, corners, strict=True)
-        if len(p.faces) == 3 and p.frames > 1
-    }
+    by_frame = _corners_by_frame(observed, corners, fit)
     places, frame_scatter, dropped = _without_odd_frames(observed, by_frame)
     places = without_rims(places, fit.state.normals, corners, fit.range_sigma_m, _common_error(fit, first, places))
     fit, used = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too)
@@ -306,6 +303,18 @@ def _expected(fit: CornerFit, places: Sequence[CornerPlaceFaces], world: FloatAr
     errors = np.zeros_like(world)
     errors[[i for i, p in enumerate(places) if p.faces]] = fit.state.world_errors
     return replace(fit.state, world_errors=errors).corners(world)
+
+
+def _corners_by_frame(places: Sequence[CornerPlaceFaces], corners: FloatArray, fit: CornerFit) -> dict[str, FloatArray]:
+    """By position: the corner of each frame alone (F, 3), where there are three faces and several frames."""
+    tasks = [(p, c) for p, c in zip(places, corners, strict=True) if len(p.faces) == 3 and p.frames > 1]
+
+    def of_frames(task: tuple[CornerPlaceFaces, FloatArray]) -> FloatArray:
+        place, corner = task
+        return frame_corners(place.faces, fit.state.normals, corner, place.frames, fit.range_sigma_m)
+
+    largest = max((len(f) for p, _ in tasks for f in p.faces.values()), default=0)
+    return {p.position: c for (p, _), c in zip(tasks, each(of_frames, tasks, largest), strict=True)}
 
 
 def _common_error(fit: CornerFit, first: Sequence[CornerPlaceFaces], places: Sequence[CornerPlaceFaces]) -> float:
