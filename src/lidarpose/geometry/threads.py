@@ -1,4 +1,4 @@
-"""Work on large arrays shared by the cores: NumPy's loops over thousands of elements run without the interpreter's lock."""
+"""Large arrays shared by the cores: NumPy loops over thousands of elements without the interpreter's lock."""
 
 from __future__ import annotations
 

@@ -36,6 +36,8 @@ SETTLED = 1e-3
 # made longer by it, which leaves a hundredth of the way where weights alone would leave a ninth.
 FOLLOWED = (1.0 - 6.0 / TUKEY_K**2 + 15.0 / TUKEY_K**4) / (1.0 - 2.0 / TUKEY_K**2 + 3.0 / TUKEY_K**4)
 MIN_RETURNS = 3
+# So many returns of a face tell how wide the loss has to be at first.
+ENOUGH = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,6 +214,12 @@ def weighted_rows(
     return residual, rows, weight
 
 
+def _some(returns: FaceReturns) -> FaceReturns:
+    """About a thousand of the returns: enough for a first scale."""
+    step = len(returns) // ENOUGH
+    return returns if step < 2 else returns.subset(np.arange(0, len(returns), step))
+
+
 def _wide_enough(sigma_m: float, residuals: Sequence[FloatArray]) -> float:
     """A first scale under which a poor start loses no face: the loss narrows as the fit improves."""
     return max(sigma_m, MIN_SIGMA_M, *(mad_sigma(r, centred=True) for r in residuals))
@@ -328,7 +336,7 @@ def fit_corner_model(
     faces = [_Face(i, j, f) for i, p in enumerate(places) for j, f in sorted(p.faces.items()) if len(f) >= MIN_RETURNS]
     names = parameter_names([p.position for p in places], options)
     corners = start.corners(world)
-    first = [face_residuals(f.returns, start.normals[f.face], corners[f.place]) for f in faces]
+    first = [face_residuals(_some(f.returns), start.normals[f.face], corners[f.place]) for f in faces]
     sigma_m = _wide_enough(sigma_m, first)
     state, step, length = start, 0, np.inf
     for step in range(1, MAX_STEPS + 1):
@@ -384,19 +392,18 @@ def _columns(count: int, options: CornerOptions) -> tuple[int, int, int]:
     return tilts, errors, errors + (3 * count if options.world_sigma_m > 0.0 else 0)
 
 
-def _corner_jacobian(
-    state: CornerState, world: FloatArray, place: int, corner: FloatArray, options: CornerOptions
-) -> FloatArray:
-    """Derivative (3, n) of a place's corner in the LiDAR frame by the parameters."""
+def _corner_jacobians(state: CornerState, world: FloatArray, corners: FloatArray, options: CornerOptions) -> FloatArray:
+    """Derivatives (P, 3, n) of the places' corners in the LiDAR frame by the parameters."""
     _, errors, width = _columns(len(world), options)
     Rt = state.T_world_lidar.rotation.T / state.scale
-    J = np.zeros((3, width))
-    J[:, :3] = -Rt
-    J[:, 3:6] = Rt @ skew(world[place] + state.world_errors[place])
+    J = np.zeros((len(world), 3, width))
+    J[:, :, :3] = -Rt
+    J[:, :, 3:6] = Rt @ skew(world + state.world_errors)
     if options.estimate_scale:
-        J[:, 6] = -corner
+        J[:, :, 6] = -corners
     if options.world_sigma_m > 0.0:
-        J[:, errors + 3 * place : errors + 3 * place + 3] = Rt
+        for i in range(len(world)):
+            J[i, :, errors + 3 * i : errors + 3 * i + 3] = Rt
     return J
 
 
@@ -413,16 +420,21 @@ def face_jacobians(
     faces: Sequence[tuple[int, int]], state: CornerState, world: FloatArray, options: CornerOptions
 ) -> dict[tuple[int, int], FloatArray]:
     """By (place, face): the derivative (3, n) of the plane's shift and two tilts by the estimate's parameters."""
+    return dict(zip(faces, _stacked_jacobians(faces, state, world, options), strict=True))
+
+
+def _stacked_jacobians(
+    faces: Sequence[tuple[int, int]], state: CornerState, world: FloatArray, options: CornerOptions
+) -> FloatArray:
+    """The derivatives of `face_jacobians` (K, 3, n), one face after the other."""
     tilts, _, width = _columns(len(world), options)
-    corners = state.corners(world)
-    of_corner = {i: _corner_jacobian(state, world, i, corners[i], options) for i, _ in faces}
-    jacobians: dict[tuple[int, int], FloatArray] = {}
-    for place, face in faces:
-        B = np.zeros((3, width))
-        B[0] = state.normals[face] @ of_corner[place]
-        B[1:, tilts + 2 * face : tilts + 2 * face + 2] = np.eye(2)
-        jacobians[place, face] = B
-    return jacobians
+    place, face = np.array(faces, dtype=np.int64).reshape(-1, 2).T
+    of_corner = _corner_jacobians(state, world, state.corners(world), options)
+    B = np.zeros((len(faces), 3, width))
+    B[:, :1] = state.normals[face][:, None] @ of_corner[place]
+    row = np.arange(len(faces))
+    B[row, 1, tilts + 2 * face] = B[row, 2, tilts + 2 * face + 1] = 1.0
+    return B
 
 
 def joint_information(fit: CornerFit, systems: Mapping[tuple[int, int], FaceSystem]) -> tuple[FloatArray, FloatArray]:
@@ -435,10 +447,10 @@ def _joined(
 ) -> tuple[FloatArray, FloatArray]:
     """The normal equations of the whole, from each face's own."""
     _, errors, width = _columns(len(world), options)
-    information, gradient = np.zeros((width, width)), np.zeros(width)
-    for key, B in face_jacobians(list(systems), state, world, options).items():
-        information += B.T @ systems[key].information @ B
-        gradient += B.T @ systems[key].gradient
+    B = _stacked_jacobians(list(systems), state, world, options)
+    rows = B.reshape(-1, width)
+    information = rows.T @ (np.array([s.information for s in systems.values()]) @ B).reshape(-1, width)
+    gradient = rows.T @ np.concatenate([s.gradient for s in systems.values()])
     if options.world_sigma_m > 0.0:
         prior = 1.0 / options.world_sigma_m**2
         information[errors:, errors:] += prior * np.eye(width - errors)

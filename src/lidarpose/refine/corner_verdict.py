@@ -341,10 +341,10 @@ def common_error_factor(fit: CornerFit, places: Sequence[CornerPlaceFaces], ring
     for i, place in enumerate(places):
         for j, returns in place.faces.items():
             residual = face_residuals(returns, fit.state.normals[j], corners[i])
-            keep = np.abs(residual) < 4.0 * fit.range_sigma_m
-            cell = direction_cells(returns.rays[:, keep], CELL_RAD)
+            keep = np.flatnonzero(np.abs(residual) < 4.0 * fit.range_sigma_m)
+            cell = direction_cells(returns.rays.take(keep, axis=1), CELL_RAD)
             count = np.bincount(cell)
-            mean = np.bincount(cell, residual[keep]) / count
+            mean = np.bincount(cell, residual.take(keep)) / count
             total += float((mean**2 * count).sum()) / fit.range_sigma_m**2
             cells += len(count)
             taken += 3.0
