@@ -294,8 +294,9 @@ def _draw(
 ) -> _Sample:
     """Draw a subsample of the remaining points, and hypotheses around random points of it."""
     if len(remaining) > SAMPLE_SIZE:
-        indices = remaining[rng.integers(0, len(remaining), SAMPLE_SIZE)]
-        indices = np.unique(indices)
+        drawn = np.zeros(len(remaining), dtype=bool)
+        drawn[rng.integers(0, len(remaining), SAMPLE_SIZE)] = True
+        indices = remaining[drawn]
     else:
         indices = remaining
     points = x[indices]
@@ -580,7 +581,7 @@ def _stands_out(
     around = height < 2.0 * GATE_SIGMAS * sigma_m
     if np.count_nonzero(inside) < max(STANDS_OUT * np.count_nonzero(around), 4.0):
         return False
-    variances = np.linalg.eigvalsh(mean_and_covariance(points[inside])[1])
+    variances = _variances(points, inside)
     if not variances[0] < THIN**2 * variances[1]:
         return False
     return _neighbours_agree(points[around], normal, sigma_m) if neighbours_agree is None else neighbours_agree
@@ -638,6 +639,13 @@ def _moments(local: Float32Array, inside: BoolArray) -> tuple[FloatArray, float,
     second = ((local * weight[:, None]).T @ local).astype(np.float64) / count - np.outer(mean, mean)
     variances, axes = np.linalg.eigh(second)
     return axes[:, 0], float(axes[:, 0] @ mean), variances
+
+
+def _variances(points: Float32Array, inside: BoolArray) -> FloatArray:
+    """Of those of the points (M, 3) that are inside, ascending (3,)."""
+    if pays(0.0, KERNELS):
+        return _moments_compiled(points, inside)[2]
+    return np.asarray(np.linalg.eigvalsh(mean_and_covariance(points[inside])[1]))
 
 
 def _moments_compiled(local: Float32Array, inside: BoolArray) -> tuple[FloatArray, float, FloatArray]:
