@@ -10,6 +10,7 @@ from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.planes import fit_plane
 from lidarpose.geometry.rings import crossing_of_points
 from lidarpose.geometry.robust import mad_sigma
+from lidarpose.measure.planes import plane_angles_deg
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.corner_result import CornerCandidate
 from lidarpose.model.corner_session import CornerPlace, CrossingBeams, MemoryCloud
@@ -19,6 +20,7 @@ from lidarpose.storage.clouds import read_cloud
 from lidarpose.storage.corner_session import FileCloud
 from lidarpose.storage.packets import read_packets
 from lidarpose.workflows.corner_target import LOOKS, PlaceCrop, fit_place, mask_of, place_corners, select_faces
+from lidarpose.workflows.measuring import measure_planes, plane_angle_sigmas, view_of_cloud
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 
@@ -197,5 +199,10 @@ def test_two_walls_and_the_floor_before_a_vlp_16() -> None:
     points = first[np.linalg.norm(first, axis=1) > 0.1]
     patches = found_planes(points)
     assert {(0, 1), (1, 1), (1, -1), (2, 1)} <= set(largest_by_direction(patches[:8]))
+    # As `measure planes` has it: 89.7 degrees, where 89.85 are told of the two walls.
+    view = view_of_cloud(Cloud(points.astype(np.float32)), None)
+    walls = measure_planes(view)[:2]
+    angle, sigma = plane_angles_deg(walls)[0, 1], plane_angle_sigmas(view, walls)[0, 1]
+    assert abs(angle - 89.85) < 3.0 * sigma < 0.6
     assert off_square_deg(patches[:2]).max() < 0.5
     assert off_square_deg(patches[:6]).max() < 1.0

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from lidarpose.geometry.arrays import FloatArray
     from lidarpose.measure.planes import MeasuredPlane
 
+# So many fit a narrow terminal.
+_ANGLES_SHOWN = 6
+
 
 def measure_planes(
     source: Path,
@@ -80,11 +83,20 @@ def _print(planes: list[MeasuredPlane], angles: FloatArray, sigmas: FloatArray, 
     from lidarpose.measure.planes import axis_angles_deg
 
     table = Table(box=SIMPLE_HEAD, title=f"Planes, normal . x = offset in the {frame} frame", title_justify="left")
-    for column in ("", "normal", "offset m", "points", "rms mm", "to x, y, z deg", "to the others deg ± sigma"):
-        table.add_column(column, justify="right")
+    for column in ("", "normal", "offset m", "points", "rms mm", "to x, y, z deg"):
+        table.add_column(column, justify="right", no_wrap=True)
     for k, p in enumerate(planes):
         normal = " ".join(f"{x:+.4f}" for x in p.plane.normal)
         axes = " ".join(f"{a:.1f}" for a in axis_angles_deg(p.plane))
-        others = "  ".join("-" if k == j else f"{a:.2f}±{sigmas[k, j]:.2f}" for j, a in enumerate(angles[k]))
-        table.add_row(str(k), normal, f"{p.plane.offset:.4f}", str(p.points), f"{1e3 * p.rms_m:.2f}", axes, others)
+        table.add_row(str(k), normal, f"{p.plane.offset:.4f}", str(p.points), f"{1e3 * p.rms_m:.2f}", axes)
     out().print(table)
+    count = min(len(planes), _ANGLES_SHOWN)
+    if count < 2:
+        return
+    more = "" if count == len(planes) else f" of the {count} largest; --json has all"
+    between = Table(box=SIMPLE_HEAD, title=f"Angles and their standard deviations, deg{more}", title_justify="left")
+    for column in ("", *map(str, range(count - 1))):
+        between.add_column(column, justify="right", no_wrap=True)
+    for k in range(1, count):
+        between.add_row(str(k), *(f"{angles[k, j]:.2f} ± {sigmas[k, j]:.2f}" for j in range(k)))
+    out().print(between)
