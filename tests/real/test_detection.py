@@ -14,14 +14,7 @@ from lidarpose.model.camera import Camera
 from lidarpose.model.targets import Panel
 from lidarpose.solve.light_plane import fit_light_plane, stripe_on_panel
 from lidarpose.solve.panel_pose import panel_pose
-
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-
-
-def folder(name: str) -> Path:
-    if not (DATA / name).is_dir():
-        pytest.skip(f"real recordings are not here: {DATA / name}")
-    return DATA / name
+from tests_support.real import recording as folder
 
 
 def grey(path: Path):

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 
 from lidarpose.detect.chessboard import find_panels
 from lidarpose.geometry.planes import Plane, fit_plane
@@ -22,6 +21,7 @@ from lidarpose.model.turntable_result import TurntableEstimate
 from lidarpose.refine.turntable import JointOptions, refine_turntable
 from lidarpose.refine.turntable_state import regular_motion
 from lidarpose.solve.panel_pose import panel_pose
+from tests_support.real import recording as folder
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -30,12 +30,6 @@ def grey(path: Path) -> np.ndarray:
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     assert image is not None, path
     return image
-
-
-def folder(name: str) -> Path:
-    if not (DATA / name).is_dir():
-        pytest.skip(f"real recordings are not here: {DATA / name}")
-    return DATA / name
 
 
 def toolbox_camera(path: Path, size: tuple[int, int]) -> Camera:

@@ -5,8 +5,6 @@ Nothing in the estimate knows of right angles; they are looked at afterwards.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -16,15 +14,7 @@ from lidarpose.model.spun_scan import MountingRun
 from lidarpose.refine.mounting_verdict import MountingOptions
 from lidarpose.storage.clouds import read_cloud
 from lidarpose.workflows.self_calibration import axis_in_fan, calibrate_by_flatness, recording_of_cloud
-
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
-
-
-def folder(name: str) -> Path:
-    found = DATA / name
-    if not found.is_dir():
-        pytest.skip(f"{found} is missing")
-    return found
+from tests_support.real import recording as folder
 
 
 def room() -> SweepRecording:

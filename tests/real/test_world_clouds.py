@@ -1,7 +1,5 @@
 """Planes and corners in clouds of real sensors. Skipped where the recordings are missing."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -21,15 +19,7 @@ from lidarpose.storage.corner_session import FileCloud
 from lidarpose.storage.packets import read_packets
 from lidarpose.workflows.corner_target import LOOKS, PlaceCrop, fit_place, mask_of, place_corners, select_faces
 from lidarpose.workflows.measuring import measure_planes, plane_angle_sigmas, view_of_cloud
-
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
-
-
-def folder(name: str) -> Path:
-    found = DATA / name
-    if not found.is_dir():
-        pytest.skip(f"{found} is missing")
-    return found
+from tests_support.real import recording as folder
 
 
 def off_square_deg(patches: tuple[PlanePatch, ...]) -> FloatArray:

@@ -12,7 +12,7 @@ from lidarpose.storage.cloud_import import PlaceOptions
 from lidarpose.storage.packets import import_packets, read_packets
 from tests_support.velodyne import DISTANCE_M, write_pcap
 
-pytest.importorskip("velodyne_decoder")
+pytest.importorskip("velodyne_decoder", reason="the extra packets is not installed")
 
 # VLP-16 User Manual, table of vertical angles by laser; rings count them from below.
 ELEVATION_DEG = {ring: -15.0 + 2.0 * ring for ring in range(16)}
