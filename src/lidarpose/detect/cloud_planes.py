@@ -466,7 +466,9 @@ def _best_patch(sample: _Sample, active: BoolArray, votes: Float32Array) -> tupl
         plane = _moment_plane(sample.points[component])
         distance = np.abs(sample.points @ plane.normal.astype(np.float32) - np.float32(plane.offset))
         inside = (distance < GATE_SIGMAS * sample.sigma_m) & active
-        component = largest_component(sample.points, inside, plane)
+        before, component = component, largest_component(sample.points, inside, plane)
+        if np.array_equal(before, component):
+            break
     return plane, component, leader_index
 
 

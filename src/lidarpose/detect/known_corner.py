@@ -167,12 +167,10 @@ def _meeting(planes: Sequence[Plane]) -> FloatArray:
 
 def _within(points: NDArray[np.floating[Any]], centre: FloatArray, radius: float) -> FloatArray:
     """Points (M, 3) within a radius: most fall out by one coordinate alone."""
-    few = points[:: max(len(points) // 500, 1)]
-    first = int(np.argmin(np.count_nonzero(np.abs(few - centre) < radius, axis=0)))
-    x = points[:, first]
-    slab = points.take(np.flatnonzero((x > centre[first] - radius) & (x < centre[first] + radius)), axis=0)
+    slab = inside_box(points, centre - radius, centre + radius)
     offset = slab - centre
-    return np.asarray(slab[np.einsum("ij,ij->i", offset, offset) < radius * radius], dtype=np.float64)
+    near = np.flatnonzero(np.einsum("ij,ij->i", offset, offset) < radius * radius)
+    return np.asarray(slab.take(near, axis=0), dtype=np.float64)
 
 
 def _planes(local: FloatArray, reference: CornerCandidate, corner: FloatArray) -> list[Plane] | None:
@@ -254,9 +252,9 @@ def _is_in_view(local: FloatArray, found: CornerCandidate, reference: CornerCand
     a, b, c = (o + shift for o in reference.outlines)
     range_m = np.sqrt(np.einsum("ij,ij->i", local, local))
     mask = FaceMask(found.corner, found.normals, found.convex, (a, b, c), found.obstacles, MARGIN_M)
-    directions = local / range_m[:, None]
-    towards, met = mask.select(directions, range_m, np.inf)
-    _, expected = mask.meet(directions[towards])
+    rays = np.ascontiguousarray(local.T) / range_m
+    towards, met = mask.select(rays.T, range_m, np.inf)
+    _, expected = mask.meet(rays.take(towards, axis=1).T)
     on_face = met[np.abs(range_m[towards] - expected) < 2.0 * GATE_SIGMAS * found.sigma_m]
     wanted, there = np.bincount(met, minlength=3), np.bincount(on_face, minlength=3)
     return bool((there >= SHARE * wanted).all() and (there >= FEWEST // 2).all())

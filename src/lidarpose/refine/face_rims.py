@@ -156,14 +156,16 @@ def _common_part(face: _Face) -> tuple[FloatArray, FloatArray]:
     """
     step = max(len(face.place) // MOST_FOR_OUTLINE, 1)
     points, place = face.points[:, ::step], face.place[::step]
-    # Half of the directions: the others are their opposites.
+    # Half of the directions: the others are their opposites. Single precision tells a micrometre.
     angle = np.arange(OUTLINE_DIRECTIONS // 2) * (2.0 * np.pi / OUTLINE_DIRECTIONS)
-    out = np.column_stack([np.cos(angle), np.sin(angle)]) @ points
+    along = np.column_stack([np.cos(angle), np.sin(angle)]).astype(np.float32)
+    out = along @ points.astype(np.float32)
     begins = np.flatnonzero(np.diff(place, prepend=-1))
     most, least = (np.median(ends.reduceat(out, begins, axis=1), axis=1) for ends in (np.maximum, np.minimum))
-    common = ((out <= most[:, None] + 1e-9) & (out >= least[:, None] - 1e-9)).all(axis=0)
-    if np.count_nonzero(common) > FEWEST_RETURNS and not common.all():
-        points, out = points.compress(common, axis=1), out.compress(common, axis=1)
+    far = np.any((out > most[:, None] + 1e-6) | (out < least[:, None] - 1e-6), axis=0)
+    if 0 < np.count_nonzero(far) < far.size - FEWEST_RETURNS:
+        points = points.compress(~far, axis=1)
+        out = along @ points.astype(np.float32)
     outermost = np.concatenate([out.argmax(axis=1), out.argmin(axis=1)])
     return points, np.asarray(points[:, outermost[outermost != np.roll(outermost, 1)]].T)
 
