@@ -23,7 +23,9 @@ from lidarpose.refine.corner_model import (
     fit_corner_model,
     frame_corners,
     place_discrepancies,
+    reweighted,
 )
+from lidarpose.refine.spot_scatter import spot_scatter, weighed_by_angle
 
 TRUTH = Pose(exp_so3([0.0, 0.5, 0.3]), np.array([0.2, -0.1, 1.5]))
 NORMALS_WORLD = unit(np.array([[0.05, 0.0, 1.0], [-0.7, 0.7, 0.0], [-0.7, -0.7, 0.1]]))
@@ -238,3 +240,65 @@ def test_fit_result_names_its_parameters() -> None:
     fit: CornerFit = fit_corner_model(observe(beams(60, rng), rng), start(), SIGMA_M, CornerOptions(0.001, True))
     assert len(fit.names) == len(fit.covariance) == 6 + 1 + 6 + 15
     assert fit.names[6] == "log_scale"
+
+
+def test_weights_of_faces_change_the_estimate_as_fewer_or_no_returns_would() -> None:
+    rng = np.random.default_rng(12)
+    places = observe(beams(80, rng), rng)
+    fit = fit_corner_model(places, start(), SIGMA_M, settled=1e-6)
+    doubled = reweighted(fit, dict.fromkeys(fit.systems, 2.0))
+    assert doubled.state.T_world_lidar.distance(fit.state.T_world_lidar)[0] < 1e-7
+    np.testing.assert_allclose(doubled.covariance, 2.0 * fit.covariance, rtol=1e-9)
+    silenced = reweighted(fit, {(1, 2): 1e9})
+    without = [replace(p, faces={j: f for j, f in p.faces.items() if (i, j) != (1, 2)}) for i, p in enumerate(places)]
+    expected = fit_corner_model(without, start(), SIGMA_M, settled=1e-6)
+    xi = silenced.state.T_world_lidar.minus(expected.state.T_world_lidar)
+    assert xi @ np.linalg.solve(expected.pose_covariance, xi) < 0.01
+    assert np.abs(xi).max() < 0.2 * np.abs(fit.state.T_world_lidar.minus(expected.state.T_world_lidar)).max()
+    np.testing.assert_allclose(np.diag(silenced.covariance), np.diag(expected.covariance), rtol=0.05)
+
+
+def spread_over_faces(
+    directions: dict[tuple[int, int], FloatArray], width_rad: float, frames: int, rng: np.random.Generator
+) -> list[CornerPlaceFaces]:
+    """Places at which every frame has the same beams, each of them off in direction by a part of its width for good."""
+    normals = TRUTH.inverse().rotate(NORMALS_WORLD)
+    places = []
+    for i in range(len(WORLD)):
+        faces = {}
+        for j in range(3):
+            u = directions[i, j]
+            truly = unit(u + rng.normal(0.0, width_rad, u.shape))
+            r = np.tile(ranges(TRUTH, normals, i, j, truly), frames) + rng.normal(0.0, SIGMA_M, frames * len(u))
+            faces[j] = FaceReturns(np.tile(u, (frames, 1)), r, np.repeat(np.arange(frames), len(u)))
+        places.append(CornerPlaceFaces(f"p{i}", WORLD[i], faces, frames))
+    return places
+
+
+def test_wide_beams_at_grazing_angles_are_weighed_by_what_they_err_together() -> None:
+    """The error of a direction is an error of the range by the range times the tangent of the angle of incidence."""
+    rng = np.random.default_rng(13)
+    directions = beams(150, rng)
+    before: list[float] = []
+    after: list[float] = []
+    for _ in range(40):
+        places = spread_over_faces(directions, 0.0015, 10, rng)
+        fit = fit_corner_model(places, start(), SIGMA_M)
+        weighed = weighed_by_angle(fit, places, spot_scatter(fit, places))
+        for found, nees in ((fit, before), (weighed, after)):
+            xi = found.state.T_world_lidar.minus(TRUTH)
+            nees.append(float(xi @ np.linalg.solve(found.pose_covariance, xi)) / 6.0)
+    assert np.mean(before) > 1.8
+    # The mean of 40 chi-squares of six degrees of freedom: 1 +- 3 standard deviations of 0.09.
+    assert 0.73 < np.mean(after) < 1.27
+
+
+def test_narrow_beams_are_weighed_as_they_are() -> None:
+    rng = np.random.default_rng(14)
+    weighed = []
+    for _ in range(20):
+        places = spread_over_faces(beams(60, rng), 0.0, 4, rng)
+        fit = fit_corner_model(places, start(), SIGMA_M)
+        weighed.append(weighed_by_angle(fit, places, spot_scatter(fit, places)) is not fit)
+    # Chance reaches the gain once in twelve times.
+    assert sum(weighed) <= 5

@@ -88,6 +88,8 @@ class CornerFit:
         By (place, face): the collapsed systems at the solution.
     loss_factor
         What the loss costs: the covariance over the inverse of the information with weights.
+    variance
+        By (place, face): the variance of a face's returns over that of the range noise, where it is not one.
     """
 
     state: CornerState
@@ -100,6 +102,7 @@ class CornerFit:
     steps: int
     returns: int
     loss_factor: float = 1.0
+    variance: Mapping[tuple[int, int], float] = field(default_factory=dict)
 
     @property
     def options(self) -> CornerOptions:
@@ -440,6 +443,27 @@ def _stacked_jacobians(
 def joint_information(fit: CornerFit, systems: Mapping[tuple[int, int], FaceSystem]) -> tuple[FloatArray, FloatArray]:
     """Information (n, n) and gradient (n,) of an estimate's parameters from other systems than its own."""
     return _joined(systems, fit.state, fit.world, fit.options)
+
+
+def reweighted(fit: CornerFit, variance: Mapping[tuple[int, int], float]) -> CornerFit:
+    """The estimate with the variance of faces' returns, by (place, face), multiplied: one step from its systems."""
+    systems = {
+        key: FaceSystem(s.information / variance.get(key, 1.0), s.gradient / variance.get(key, 1.0), s.returns)
+        for key, s in fit.systems.items()
+    }
+    information, gradient = joint_information(fit, systems)
+    delta = _solve(information, gradient, "the pose: too few places, or all on one line")
+    jacobians = face_jacobians(list(systems), fit.state, fit.world, fit.options)
+    moved = {
+        key: replace(s, gradient=s.gradient - s.information @ (jacobians[key] @ delta)) for key, s in systems.items()
+    }
+    return replace(
+        fit,
+        state=_moved(fit.state, delta, fit.options),
+        covariance=np.linalg.inv(information) * fit.loss_factor,
+        systems=moved,
+        variance=variance,
+    )
 
 
 def _joined(

@@ -16,7 +16,8 @@ from lidarpose.model.corner_result import CornerPlaceFaces
 from lidarpose.model.corner_session import CloudFrame
 from lidarpose.model.observation import LeftOut
 from lidarpose.refine.beam_crossing import SeenCrossing
-from lidarpose.refine.corner_model import CornerFit, direction_cells, face_residuals, place_discrepancies
+from lidarpose.refine.corner_model import CornerFit, place_discrepancies
+from lidarpose.refine.spot_scatter import SpotScatter, common_error_factor
 
 # A turn of the target: far beyond chance (three degrees of freedom, six where a place stands by itself) and large
 # enough to matter.
@@ -25,7 +26,6 @@ OWN_TURN_STATISTIC, OWN_TURN_DEG = 60.0, 0.3
 # World coordinates that disagree by more than this with one another are no measurement.
 WORLD_SIGMA_DOUBTFUL_MM = 10.0
 NOISE_RATIO_DOUBTFUL = 3.0
-CELL_RAD = np.radians(1.5)
 # Where distances disagree by less, nobody asks why.
 LEAST_MISFIT_M = 0.002
 
@@ -36,7 +36,7 @@ class CornerEvidence:
 
     `rings_told` are the degrees of freedom that offsets of rings have taken from the residuals; `crossing` is where a
     multi-beam LiDAR's beams seem to cross, None where that was not asked. `further_covariance` (n, n) is of
-    what the residuals cannot tell.
+    what the residuals cannot tell; `scatter` is that of the spots, where it is known.
     """
 
     positions: tuple[str, ...]
@@ -51,6 +51,7 @@ class CornerEvidence:
     further_figures: Mapping[str, Any] = field(default_factory=dict)
     crossing: SeenCrossing | None = None
     further_covariance: FloatArray | None = None
+    scatter: Mapping[tuple[int, int], SpotScatter] | None = None
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ def judge_corner_fit(
 ) -> Quality:
     """Verdict on the joint estimate, with reasons and figures."""
     verdict = _Verdict()
-    factor = common_error_factor(fit, places, evidence.rings_told)
+    factor = common_error_factor(fit, places, evidence.rings_told, evidence.scatter)
     moves, statistic, known = place_discrepancies(fit)
     # Each place's corner by its own returns, at the common orientation: what the world coordinates are held against.
     corners = fit.state.scale * (fit.state.corners(fit.world) + np.where(known[:, None], moves[:, :3], 0.0))
@@ -328,30 +329,6 @@ def _judge_noise(verdict: _Verdict, fit: CornerFit, evidence: CornerEvidence) ->
             f"ranges scatter by {1e3 * fit.range_sigma_m:.1f} mm, far more than the {1e3 * stated:.1f} mm stated: "
             "the faces may not be flat, or may not be the target's"
         )
-
-
-def common_error_factor(fit: CornerFit, places: Sequence[CornerPlaceFaces], rings_told: float = 0.0) -> float:
-    """How much wider the covariance has to be because returns of one spot err together, frame after frame.
-
-    The mean residual of each cell of 1.5 degrees should scatter as the range noise over its number of returns; faces
-    that are not flat and beams with offsets of their own make it scatter more.
-    """
-    corners = fit.state.corners(fit.world)
-    total, cells, taken = 0.0, 0, rings_told
-    for i, place in enumerate(places):
-        for j, returns in place.faces.items():
-            residual = face_residuals(returns, fit.state.normals[j], corners[i])
-            keep = np.flatnonzero(np.abs(residual) < 4.0 * fit.range_sigma_m)
-            cell = direction_cells(returns.rays.take(keep, axis=1), CELL_RAD)
-            count = np.bincount(cell)
-            mean = np.bincount(cell, residual.take(keep)) / count
-            total += float((mean**2 * count).sum()) / fit.range_sigma_m**2
-            cells += len(count)
-            taken += 3.0
-    dof = max(cells - taken, 1.0)
-    ratio = total / dof
-    # Chance alone reaches one plus a few standard deviations of a chi-square over its degrees of freedom.
-    return float(ratio) if ratio > 1.0 + 4.0 * np.sqrt(2.0 / dof) else 1.0
 
 
 def _rms(rows: FloatArray) -> float:

@@ -66,7 +66,8 @@ def turntable_share(
                 continue
             own = _of_frame(returns, frame)
             by_parameters = _face_pull(own, fit.state.normals[j], corners[i], fit.range_sigma_m, shifts)
-            share = jacobians[i, j].T @ (by_parameters * (len(returns) / len(own)))
+            weight = len(returns) / len(own) / fit.variance.get((i, j), 1.0)
+            share = jacobians[i, j].T @ (weight * by_parameters)
             pull = share if pull is None else pull + share
     if pull is None or C is None:
         return None

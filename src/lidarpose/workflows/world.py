@@ -34,13 +34,13 @@ from lidarpose.refine.corner_model import (
 from lidarpose.refine.corner_verdict import (
     CornerEvidence,
     PrecisionLimits,
-    common_error_factor,
     cornerwise_covariance,
     judge_corner_fit,
     judge_corners,
 )
 from lidarpose.refine.face_rims import without_rims
 from lidarpose.refine.ring_offsets import RingOffsets, Rings, find_rings, ring_offsets, some_returns
+from lidarpose.refine.spot_scatter import common_error_factor, spot_scatter, weighed_by_angle
 from lidarpose.solve.corner_alignment import cayley_pose, pair_scale, svd_pose
 from lidarpose.solve.corner_matching import face_order
 from lidarpose.workflows.corner_target import (
@@ -262,6 +262,9 @@ def _joint(
     places = without_rims(places, fit.state.normals, corners, fit.range_sigma_m, _common_error(fit, first, places))
     fit, used = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too)
     fit, used, offsets, crossing = _without_ring_offsets(mended, fit, used)
+    scatter = spot_scatter(fit, used)
+    if offsets is None and (crossing is None or not crossing.told):
+        fit = weighed_by_angle(fit, used, scatter)
     left_out += [
         LeftOut(f"{name}: {n} frames", "their corner, or how much of the faces they show, is far from the others'")
         for name, n in dropped.items()
@@ -280,6 +283,7 @@ def _joint(
         {} if offsets is None else offsets.figures,
         crossing,
         None if share is None else share.covariance,
+        scatter,
     )
     quality = judge_corner_fit(fit, used, evidence, limits)
     covariance = fit.covariance * float(quality.figures["covariance_factor"])
