@@ -69,9 +69,11 @@ class Slab:
         As fitted to the subsample's points.
     raster, allowed
         The cells of the plane that they occupy, and their neighbours; none on the raster's border.
-    rows : (6, 4)
-        Take (x, y, z, 1) to 1, the height over the plane, two coordinates on it from near the patch's middle, and the
-        two coordinates in cells of the raster.
+    rows : (4, 4)
+        Take (x, y, z, 1) to the terms: 1, the height over the plane, and two coordinates u and v on it from near the
+        patch's middle.
+    first_cell : (2,)
+        Where that middle is in the raster, in cells.
     """
 
     plane: Plane
@@ -79,6 +81,7 @@ class Slab:
     raster: PlaneRaster
     allowed: BoolArray
     rows: FloatArray
+    first_cell: FloatArray
 
     @staticmethod
     def around(points: NDArray[np.floating], plane: Plane, sigma_m: float) -> Slab:
@@ -89,24 +92,23 @@ class Slab:
         allowed = grown(occupied.reshape(raster.shape))
         allowed[[0, -1]] = allowed[:, [0, -1]] = False
         middle = raster.axes @ points.mean(axis=0, dtype=np.float64)
-        rows = np.zeros((6, 4))
+        rows = np.zeros((4, 4))
         rows[0, 3] = 1.0
         rows[1] = np.append(plane.normal, -plane.offset)
-        rows[2:4, :3], rows[2:4, 3] = raster.axes, -middle
-        rows[4:, :3], rows[4:, 3] = raster.axes / raster.cell_m, -raster.origin
-        return Slab(plane, sigma_m, raster, allowed.ravel(), rows)
+        rows[2:, :3], rows[2:, 3] = raster.axes, -middle
+        return Slab(plane, sigma_m, raster, allowed.ravel(), rows, middle / raster.cell_m - raster.origin)
 
-    def holds(self, across: Float32Array) -> BoolArray:
-        """Which of points lie in allowed cells, by their coordinates (2, M) in cells, of which the second is lost."""
-        return np.asarray(self.allowed.take(self._numbers(across), mode="clip"))
+    def holds(self, terms: Float32Array) -> BoolArray:
+        """Which of points lie in allowed cells, by their terms (4, M)."""
+        return np.asarray(self.allowed.take(self._numbers(terms), mode="clip"))
 
     def cells(self, terms: Float32Array) -> NDArray[np.int32]:
-        """Numbers (M,) of the cells of points on the raster by their terms (1, height, u, v) (4, M)."""
-        across = terms[2:] / np.float32(self.raster.cell_m)
-        across += (self.rows[4:, 3] - self.rows[2:4, 3] / self.raster.cell_m).astype(np.float32)[:, None]
-        return np.asarray(np.clip(self._numbers(across), 0, len(self.allowed) - 1))
+        """Numbers (M,) of the cells of points on the raster by their terms (4, M)."""
+        return np.asarray(np.clip(self._numbers(terms), 0, len(self.allowed) - 1))
 
-    def _numbers(self, across: Float32Array) -> NDArray[np.int32]:
+    def _numbers(self, terms: Float32Array) -> NDArray[np.int32]:
+        across = terms[2:] * np.float32(1.0 / self.raster.cell_m)
+        across += self.first_cell.astype(np.float32)[:, None]
         u, v = across
         # What lies outside ends on the border, which is never allowed, or beyond the first or last cell.
         np.maximum(v, np.float32(0.0), out=v)
@@ -372,8 +374,8 @@ def _claim(x: NDArray[np.floating], free: BoolArray | None, slabs: Sequence[Slab
     for slab, mine in zip(slabs, near, strict=True):
         indices = np.flatnonzero(mine)
         to_slab = slab.rows.astype(np.float32)
-        few = points.take(indices, axis=1)
-        terms, held = to_slab[:4] @ few, slab.holds(to_slab[4:] @ few)
+        terms = to_slab @ points.take(indices, axis=1)
+        held = slab.holds(terms)
         if np.count_nonzero(held) < 0.5 * len(held):
             indices, terms = indices[held], terms.compress(held, axis=1)
             held = np.ones(len(indices), dtype=bool)
@@ -395,7 +397,11 @@ def _compiled_claims(
     from lidarpose.detect.plane_kernels import claims_of_block
 
     gates = np.array([GATE_SIGMAS * s.sigma_m for s in slabs], dtype=np.float32)
-    rows = np.stack([np.vstack([s.rows[1] / (CLAIM_SIGMAS * s.sigma_m), s.rows[1:]]) for s in slabs]).astype(np.float32)
+    rows = np.zeros((len(slabs), 5, 4), dtype=np.float32)
+    for k, slab in enumerate(slabs):
+        rows[k, 0] = slab.rows[1] / (CLAIM_SIGMAS * slab.sigma_m)
+        rows[k, 1:4] = slab.rows[1:]
+        rows[k, 4, 0], rows[k, 4, 1:3] = 1.0 / slab.raster.cell_m, slab.first_cell
     allowed = np.concatenate([s.allowed for s in slabs]).view(np.uint8)
     starts = np.cumsum([0] + [len(s.allowed) for s in slabs])
     widths = np.array([s.raster.shape[1] for s in slabs])

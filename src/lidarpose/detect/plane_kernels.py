@@ -42,26 +42,23 @@ def _hold(x: Any, y: Any, z: Any, rows: Any, near: Any, width: int, allowed: Any
     h_x, h_y, h_z, h_1 = rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3]
     u_x, u_y, u_z, u_1 = rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3]
     v_x, v_y, v_z, v_1 = rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3]
-    m_x, m_y, m_z, m_1 = rows[3, 0], rows[3, 1], rows[3, 2], rows[3, 3]
-    n_x, n_y, n_z, n_1 = rows[4, 0], rows[4, 1], rows[4, 2], rows[4, 3]
-    zero, border = np.float32(0.0), np.float32(width - 1)
-    first, last, line = np.int32(0), np.int32(len(allowed) - 1), np.int32(width)
+    per_m, from_u, from_v = rows[3, 0], rows[3, 1], rows[3, 2]
+    zero, line = np.float32(0.0), np.int32(width)
+    last_u, last_v = np.float32(len(allowed) // width - 1), np.float32(width - 1)
     kept = np.uint64(0)
     for j in range(len(near)):
         i = np.uint64(near[j])
         p, q, r = x[i], y[i], z[i]
-        n = n_x * p + n_y * q + n_z * r + n_1
-        # What lies outside ends on the border, which is never allowed, or beyond the first or last cell.
-        n = n if n > zero else zero
-        n = n if n < border else border
-        cell = np.int32(np.int32(m_x * p + m_y * q + m_z * r + m_1) * line + np.int32(n))
-        cell = cell if cell > first else first
-        cell = cell if cell < last else last
-        mine = allowed[np.uint64(cell)]
+        u = u_x * p + u_y * q + u_z * r + u_1
+        v = v_x * p + v_y * q + v_z * r + v_1
+        # What lies outside ends on the border, which is never allowed.
+        m = min(max(u * per_m + from_u, zero), last_u)
+        n = min(max(v * per_m + from_v, zero), last_v)
+        mine = allowed[np.uint64(np.int32(m) * line + np.int32(n))]
         index[kept] = i
         height[kept] = h_x * p + h_y * q + h_z * r + h_1
-        along_u[kept] = u_x * p + u_y * q + u_z * r + u_1
-        along_v[kept] = v_x * p + v_y * q + v_z * r + v_1
+        along_u[kept] = u
+        along_v[kept] = v
         times[i] += mine
         kept += np.uint64(mine)
     return int(kept)
@@ -125,8 +122,9 @@ def claims_of_block(points: Any, free: Any, rows: Any, allowed: Any, starts: Any
 
     Parameters
     ----------
-    rows : (K, 6, 4), single precision
-        Take (x, y, z, 1) to the height in units of the gate for claims, the height, u and v, and both in cells.
+    rows : (K, 5, 4), single precision
+        Take (x, y, z, 1) to the height in units of the gate for claims, the height, u and v; the last one holds cells a
+        metre, and what to add to u and to v in cells.
     allowed, starts, widths
         All slabs' cells as one row of 0 and 1, where each slab's begin (K + 1,), and how many each has in a line (K,).
     gates : (K,), single precision
