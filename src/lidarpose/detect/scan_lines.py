@@ -79,6 +79,18 @@ class Beams:
         """Range times the root of the sweeps that count (N,): over the noise, an inverse range in units of sigma."""
         return np.asarray(self.range_m * np.sqrt(np.minimum(self.count, MOST_SWEEPS)))
 
+    @cached_property
+    def _columns(self) -> dict[float, tuple[FloatArray, FloatArray]]:
+        return {}
+
+    def columns(self, noise: float) -> tuple[FloatArray, FloatArray]:
+        """What lines are fitted with at a given noise: columns of cos and sin (2, N), and inverse ranges (N,), both
+        in units of sigma."""
+        if noise not in self._columns:
+            weight = self.weight_m * self.range_m / noise
+            self._columns[noise] = self.rays * weight, self.weight_m / noise
+        return self._columns[noise]
+
 
 def find_lines(scan: Scan, spec: LidarSpec | None = None) -> tuple[ScanLine, ...]:
     """The straight lines of a scan, in ascending angle.
@@ -281,8 +293,8 @@ class _Fit:
 
 
 def _columns(beams: Beams, noise: float, first: int, last: int) -> tuple[FloatArray, FloatArray]:
-    weight = beams.weight_m[first:last] * beams.range_m[first:last] / noise
-    return beams.rays[:, first:last] * weight, beams.weight_m[first:last] / noise
+    rows, q = beams.columns(noise)
+    return rows[:, first:last], q[first:last]
 
 
 def _fit(beams: Beams, noise: float, first: int, last: int, weights: FloatArray | None = None) -> _Fit:
@@ -339,7 +351,11 @@ def _best_cut(beams: Beams, noise: float, fit: _Fit) -> tuple[int, float, float]
         return fit.first, 0.0, 0.0
     rows, _ = _columns(beams, noise, fit.first, fit.last)
     e = fit.residuals
-    sums = np.cumsum(np.stack([rows[0] ** 2, rows[0] * rows[1], rows[1] ** 2, rows[0] * e, rows[1] * e]), axis=1)
+    c, s = rows
+    sums = np.empty((5, n))
+    for k, (a, b) in enumerate(((c, c), (c, s), (s, s), (c, e), (s, e))):
+        np.multiply(a, b, out=sums[k])
+    np.cumsum(sums, axis=1, out=sums)
     left, right = sums[:, 2:-3], sums[:, -1:] - sums[:, 2:-3]
     gain = np.zeros(left.shape[1])
     for cc, cs, ss, ec, es in (left, right):

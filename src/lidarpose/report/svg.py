@@ -163,7 +163,7 @@ class Chart:
         """Dots, as one path: thousands of them stay small. The dot's size is its stroke's."""
         px, py = self.px(x), self.py(y)
         ok = np.isfinite(px) & np.isfinite(py)
-        data = "".join(f"M{u:.1f} {v:.1f}h0" for u, v in zip(px[ok], py[ok], strict=True))
+        data = "".join(f"M{u:.1f} {v:.1f}h0" for u, v in zip(px[ok].tolist(), py[ok].tolist(), strict=True))
         if data:
             self.parts.append(el("path", d=data, class_=f"dots {class_}", stroke_width=2.0 * radius))
 
@@ -292,10 +292,13 @@ def drawing(width: float, height: float, parts: Sequence[Markup], description: s
 
 def path_data(x: ArrayLike, y: ArrayLike) -> str:
     """Path commands through points; NaN breaks the line."""
+    px, py = (np.asarray(values, dtype=float).ravel() for values in (x, y))
+    fine = (np.isfinite(px) & np.isfinite(py)).tolist()
     out: list[str] = []
     pen = "M"
-    for u, v in zip(np.asarray(x, dtype=float).ravel(), np.asarray(y, dtype=float).ravel(), strict=True):
-        if np.isfinite(u) and np.isfinite(v):
+    # Python's own numbers, which are written ten times as fast as NumPy's.
+    for u, v, ok in zip(px.tolist(), py.tolist(), fine, strict=True):
+        if ok:
             out.append(f"{pen}{u:.1f} {v:.1f}")
             pen = "L"
         else:

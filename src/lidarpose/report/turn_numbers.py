@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,7 +62,7 @@ def turn_numbers(run: TurntableRun) -> TurnNumbers | None:
         reading,
         np.array([1e3 * np.sqrt(max(np.trace(p.centre_covariance()), 0.0)) for p in poses]),
         np.array([np.rad2deg(np.sqrt(max(np.trace(p.rotation_covariance()), 0.0))) for p in poses]),
-        {d: np.array([_point_mm(p, d) for p in poses]) for d in DISTANCES_M},
+        {d: _points_mm(poses, d) for d in DISTANCES_M},
         np.asarray((reading >= low) & (reading <= high)),
     )
 
@@ -100,10 +100,11 @@ def used_positions(run: TurntableRun, *, wholly: bool = False) -> set[str]:
     return {position for position, count in counts.items() if count >= least}
 
 
-def _point_mm(pose: UncertainPose, distance_m: float) -> float:
-    """Standard deviation of a point at a distance, in the worst of the scan plane's directions, mm."""
+def _points_mm(poses: Sequence[UncertainPose], distance_m: float) -> FloatArray:
+    """Standard deviations (P,) of a point at a distance, each in the worst of the scan plane's directions, mm."""
     beams = np.column_stack([np.cos(_AZIMUTHS), np.sin(_AZIMUTHS), np.zeros(len(_AZIMUTHS))])
-    points = pose.pose @ (distance_m * beams)
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -skew(points)], axis=2)
-    variance = np.einsum("nij,jk,nik->n", J, pose.covariance, J)
-    return float(1e3 * np.sqrt(max(float(variance.max()), 0.0)))
+    points = np.stack([p.pose @ (distance_m * beams) for p in poses])
+    J = np.concatenate([np.broadcast_to(np.eye(3), (*points.shape, 3)), -skew(points)], axis=3)
+    covariance = np.stack([p.covariance for p in poses])
+    variance = ((J @ covariance[:, None]) * J).sum(axis=(2, 3))
+    return np.asarray(1e3 * np.sqrt(np.maximum(variance.max(axis=1), 0.0)))
