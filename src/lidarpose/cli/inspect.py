@@ -149,7 +149,8 @@ def _lines(session: TurntableSession, inspection: TurntableInspection) -> list[s
     ]
     lines += [
         f"weak: {d.name}: {d.sigma_mm:.3f} mm, {d.sigma_deg:.4f} deg at {d.angle_deg:.0f} deg. {d.remedy}"
-        for d in inspection.weak[:3]
+        for k, d in enumerate(inspection.weak[:3])
+        if d.name not in {worse.name for worse in inspection.weak[:k]}
     ]
     lines += [
         f"would be with {r.what}: {r.inside_mm:.3f} mm {r.inside_deg:.4f} deg amid the readings, "

@@ -252,11 +252,17 @@ class _Plan:
 
 def _further(now: _Plan) -> tuple[_Plan, ...]:
     """What else could be recorded."""
-    wider = now.middle_rad + 2.0 * (now.angles_rad - now.middle_rad)
+    # Beyond the arc the scan may leave the board: what is recorded stays, so that more is never said to be worse.
+    wider = np.concatenate([now.angles_rad, now.middle_rad + 2.0 * (now.angles_rad - now.middle_rad)])
     arc_deg = float(np.rad2deg(np.ptp(wider)))
     elsewhere = {_again(name): _elsewhere(found) for name, found in now.board.items()}
     return (
-        _Plan(f"twice the arc ({arc_deg:.0f} deg, as many places)", wider, now.board, now.seen),
+        _Plan(
+            f"as many places again over twice the arc ({arc_deg:.0f} deg, as far as the scan stays on the board)",
+            wider,
+            now.board,
+            [*now.seen, *now.seen],
+        ),
         _Plan(
             "four times the places over the same arc",
             np.repeat(now.angles_rad, 4),
