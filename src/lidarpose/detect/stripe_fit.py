@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarpose.detect.stripe_bands import (
     Bands,
@@ -56,6 +57,8 @@ _WORST_SIGMA_PX = 0.8
 _PULL_PX = 1.5
 # What the squares' edges and the blur are known to at best, in what they move a point by.
 _MODEL_SIGMA_PX = 0.01
+# By what the noise of pixels may be off, and how often the part that all points share is halved.
+_NOISE_FACTORS, _HALVINGS = np.array([[1.0], [1.25], [1.5], [1.75], [2.0], [2.5]]), 8
 # A step that changes the width by this share and the typical centre by so many of its sigmas is the last one.
 _SETTLED_WIDTH, _SETTLED_SIGMAS, _MOST_STEPS = 0.04, 1.5, 6
 # Order of the unknowns: the first three are each profile's own, the width is common.
@@ -73,8 +76,8 @@ class StripeFit:
     dark_ratio
         Light sent back by dark squares against light ones, at the laser's colour.
     inflation
-        By how much the scatter about a smooth curve exceeds what the noise explains (1: not at all); it is in the
-        points' standard deviations.
+        By how much the scatter about a smooth curve exceeds what the noise explains (1: not at all); the points'
+        standard deviations are those that explain it.
     """
 
     points: StripePoints
@@ -424,6 +427,31 @@ def _smooth(bands: Bands, state: _State) -> _Smooth:
     return _Smooth(curves, kept, residual, problems)
 
 
+def _stated_sigma(offset: FloatArray, sigma: FloatArray) -> NDArray[np.float64]:
+    """What points' offsets (n,) from the curve say their standard deviations are: that of their pixels' noise, times a
+    factor, beside a part that all share.
+
+    Speckle that the lens has smeared over neighbours moves strong and faint points by the same; a factor alone would
+    state strong points too well and faint ones too badly. The likelier of some factors, each with its shared part.
+    """
+    scaled = _NOISE_FACTORS * sigma
+    far = np.abs(offset)
+    middle = int(0.5 * (len(offset) - 1))
+
+    def spread(sigmas: FloatArray) -> FloatArray:
+        return MAD_TO_SIGMA * np.partition(far / sigmas, middle, axis=1)[:, middle : middle + 1]
+
+    # The shared part with which each factor's spread is 1, by halving what it lies between.
+    low, high = np.zeros((len(scaled), 1)), np.full((len(scaled), 1), MAD_TO_SIGMA * quantile(far, 0.5))
+    for _ in range(_HALVINGS):
+        between = 0.5 * (low + high)
+        wide = spread(np.hypot(scaled, between)) > 1.0
+        low, high = np.where(wide, between, low), np.where(wide, high, between)
+    stated = np.where(spread(scaled) > 1.0, np.hypot(scaled, high), scaled)
+    misfit = (np.log(stated) + 0.5 * np.minimum((far / stated) ** 2, 9.0)).sum(axis=1)
+    return np.asarray(stated[int(np.argmin(misfit))], dtype=np.float64)
+
+
 def _points(bands: Bands, smooth: _Smooth, steep: bool, state: _State, b: int) -> StripeFit | str:
     """Merge blocks of neighbouring profiles of band `b`; their scatter about the curve corrects what the noise model
     states."""
@@ -442,9 +470,10 @@ def _points(bands: Bands, smooth: _Smooth, steep: bool, state: _State, b: int) -
         return _TOO_FEW
     freedom = np.sqrt(max(len(u) - 4, 1) / len(u))
     inflation = max(MAD_TO_SIGMA * quantile(np.abs(offset / sigma), 0.5) / freedom, 1.0)
+    sigma = _stated_sigma(offset / freedom, sigma)
     norm = np.hypot(cosine, sine)
     cosine, sine = cosine / norm, sine / norm
-    sigma = np.hypot(sigma * inflation, _MODEL_SIGMA_PX) * cosine
+    sigma = np.hypot(sigma, _MODEL_SIGMA_PX) * cosine
     # Points on dark squares beside points on light ones: a hundredth of their weight, and mostly trouble.
     best = quantile(sigma, 0.2)
     worth = sigma < np.clip(8.0 * best, 0.1, _WORST_SIGMA_PX)
