@@ -37,6 +37,8 @@ def test_columns_may_stand_in_any_order_and_behind_a_byte_order_mark(tmp_path: P
         ("", "is empty"),
         ("angle_deg,range_m\n", "has no beams"),
         ("angle_deg\n1\n", "the column range_m is missing"),
+        ("angle_deg;range_m\n1,5;2,5\n", "has semicolons between its columns"),
+        ("angle_deg\trange_m\n1\t2\n", "has tabs between its columns"),
         ("angle_deg,range_m,range_m\n1,2,3\n", "stands twice"),
         ("angle_deg,range_mm\n1,2\n", "range_m"),
         ("angle_deg,range_m\n1,2\n2\n", "line 3 has 1 values"),

@@ -188,6 +188,11 @@ def _check_header(
     wanted = ",".join(required) + "".join(f"[,{name}]" for name in optional)
     if not any(columns):
         raise InputError(path, "is empty", field="line 1", expected=f"the header {wanted}")
+    other = {";": "semicolons", "\t": "tabs"}.get(next((c for c in ";\t" if c in header[0]), ""))
+    if len(columns) == 1 and len(required) > 1 and other:
+        raise InputError(
+            path, f"has {other} between its columns", field="line 1", expected="commas, and decimal points"
+        )
     for name in required:
         if name not in columns:
             raise InputError(path, f"the column {name} is missing", field="line 1", expected=f"the header {wanted}")

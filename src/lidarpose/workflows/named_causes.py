@@ -23,6 +23,8 @@ Places = Sequence[PlaceFeatures]
 _STILL_PX = 1.0
 _TURNED_RAD = np.deg2rad(0.5)
 _MOST_USED = 0.7
+# A whole turn in radians, taken for degrees.
+_RADIANS_SPAN = 2.0 * np.pi
 _RANGES = ((1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"), (0.3048, "feet"))
 _READINGS = (
     (2.0, "half of what they should be"),
@@ -84,6 +86,11 @@ def _cause(
                 f"The turntable's readings are {words}: multiplied by {factor:.4g} they fit",
                 "Write the true readings in degrees into positions.csv",
             )
+    if (span := _widest_scan_deg(session)) < _RADIANS_SPAN:
+        return (
+            f"The beam angles of every scan span {span:.1f} degrees or less: they look like radians",
+            "Write the beams' angles in degrees into the scans",
+        )
     by_name = {place.position: place for place in places}
     reverse = reversed_part(session, list(by_name), lambda names: solve([by_name[name] for name in names]))
     if reverse:
@@ -92,6 +99,12 @@ def _cause(
             "Mend these files (negate their beam angles, or reverse their ranges) and calibrate again",
         )
     return None
+
+
+def _widest_scan_deg(session: TurntableSession) -> float:
+    """What the widest scan spans."""
+    spans = [np.ptp(place.scan.load().angle_rad) for place in session.places if place.scan is not None]
+    return float(np.rad2deg(max(spans, default=np.inf)))
 
 
 def stands_still(places: Places) -> bool:
