@@ -10,6 +10,8 @@ import numpy as np
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 
 SQRT3 = float(np.sqrt(3.0))
+# OpenBLAS shares products of more multiplications than 2^18 among threads.
+_MOST_PRODUCTS = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,19 +125,29 @@ def add_lines(
     information, gradient = into
     if not len(reduced):
         return 0.0
-    local = np.swapaxes(to_parameters, 1, 2) @ reduced[:, :-1, :-1] @ to_parameters
-    slope = -(np.swapaxes(to_parameters, 1, 2) @ reduced[:, :-1, -1:])[:, :, 0]
-    information[:n_global, :n_global] += local[:, :n_global, :n_global].sum(axis=0)
-    gradient[:n_global] += slope[:, :n_global].sum(axis=0)
-    for k in np.unique(slot):
+    weighted = reduced[:, :-1, :-1] @ to_parameters
+    for k in np.unique(slot).tolist():
         mine = slot == k
-        at = slice(n_global + 6 * int(k), n_global + 6 * int(k) + 6)
-        cross = local[mine][:, :n_global, n_global:].sum(axis=0)
-        information[:n_global, at] += cross
-        information[at, :n_global] += cross.T
-        information[at, at] += local[mine][:, n_global:, n_global:].sum(axis=0)
-        gradient[at] += slope[mine][:, n_global:].sum(axis=0)
+        to = to_parameters[mine].reshape(-1, to_parameters.shape[2])
+        block = _product(to, weighted[mine].reshape(to.shape))
+        slope = -np.einsum("n,nj->j", reduced[mine][:, :-1, -1].ravel(), to)
+        at = slice(n_global + 6 * k, n_global + 6 * k + 6)
+        information[:n_global, :n_global] += block[:n_global, :n_global]
+        information[:n_global, at] += block[:n_global, n_global:]
+        information[at, :n_global] += block[:n_global, n_global:].T
+        information[at, at] += block[n_global:, n_global:]
+        gradient[:n_global] += slope[:n_global]
+        gradient[at] += slope[n_global:]
     return float(reduced[:, -1, -1].sum())
+
+
+def _product(a: FloatArray, b: FloatArray) -> FloatArray:
+    """a^T b of two tall matrices (N, n), in parts so small that BLAS starts no threads, which would cost more."""
+    part = max(_MOST_PRODUCTS // a.shape[1] ** 2, 1)
+    found = np.zeros((a.shape[1], b.shape[1]))
+    for first in range(0, len(a), part):
+        found += a[first : first + part].T @ b[first : first + part]
+    return found
 
 
 def covariance_and_condition(information: FloatArray) -> tuple[FloatArray, float, FloatArray]:
