@@ -108,7 +108,9 @@ def tukey_weights(standardised: ArrayLike, k: float = 4.685) -> FloatArray:
 def box_plot_inliers(values: ArrayLike, whisker: float = 1.5) -> BoolArray:
     """Which values (N,) lie within Tukey's whiskers (quartiles widened by `whisker` interquartile ranges)."""
     x = np.asarray(values, dtype=np.float64)
-    low, high = np.percentile(x, [25.0, 75.0])
+    if np.isnan(x).any():
+        return np.zeros(len(x), dtype=bool)
+    low, high = quantile(x, 0.25), quantile(x, 0.75)
     reach = whisker * (high - low)
     return np.asarray((x >= low - reach) & (x <= high + reach))
 

@@ -612,13 +612,17 @@ def estimate_world_sigma(fit: CornerFit) -> tuple[float, float]:
     information, gradient = _joined(fit.systems, state, fit.world, options)
     errors = _columns(len(fit.world), options)[1]
     size = len(gradient) - errors
-    information[errors:, errors:] -= np.eye(size)
-
+    # Of the errors alone, all else being free, along axes on which they are independent.
+    solved = np.linalg.solve(
+        information[:errors, :errors], np.column_stack([information[:errors, errors:], gradient[:errors]])
+    )
+    own = information[errors:, errors:] - np.eye(size) - information[errors:, :errors] @ solved[:, :-1]
+    sureness, axes = np.linalg.eigh(0.5 * (own + own.T))
+    along = (axes.T @ (gradient[errors:] - information[errors:, :errors] @ solved[:, -1])) ** 2
     grid = np.geomspace(1e-5, 0.5, 60)
-    N = np.repeat(information[None], len(grid), axis=0)
-    N[:, errors:, errors:] += np.eye(size) / grid[:, None, None] ** 2
-    explained = np.linalg.solve(N, np.broadcast_to(gradient, (len(grid), len(gradient)))[..., None])[..., 0] @ gradient
-    values = np.linalg.slogdet(N)[1] + 2.0 * size * np.log(grid) - explained
+    variance = grid[:, None] ** 2
+    grown = 1.0 + variance * np.maximum(sureness, 0.0)
+    values = (np.log(grown) - variance * along / grown).sum(axis=1)
     best = int(np.argmin(values))
     gain = float(values[0] - values[best])
     return (float(grid[best]), gain) if gain > 0.5 else (0.0, 0.0)

@@ -11,6 +11,7 @@ import threading
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any, Protocol
 
@@ -179,18 +180,27 @@ def lent_points(path: Path, offset: int, row: np.dtype[Any], count: int) -> NDAr
     InputError
         If x, y or z is missing, or fewer rows are there.
     """
-    single = _require_coordinates(row, path)
-    kind = np.dtype(np.float32 if single else np.float64)
-    if count * row.itemsize > LENT_BYTES or any(row[name] != kind for name in XYZ):
+    _require_coordinates(row, path)
+    layout = _side_by_side(row)
+    if layout is None or count * row.itemsize > LENT_BYTES:
         return None
-    places = [row.fields[name][1] for name in XYZ] if row.fields else []
-    if places != [places[0] + k * kind.itemsize for k in range(3)] or (places[0] | row.itemsize) % kind.itemsize:
-        return None
+    kind, first = layout
     memory = _lent.bytes(count * row.itemsize)
     with path.open("rb", buffering=0) as file:
         file.seek(offset)
         _require_all(path, _fill(file, memory.data) // max(row.itemsize, 1), count)
-    return np.ndarray((count, 3), kind, memory.data, places[0], (row.itemsize, kind.itemsize))
+    return np.ndarray((count, 3), kind, memory.data, first, (row.itemsize, kind.itemsize))
+
+
+@lru_cache(maxsize=16)
+def _side_by_side(row: np.dtype[Any]) -> tuple[np.dtype[Any], int] | None:
+    """The type of x, y and z, and where x lies in a row, if they lie side by side as NumPy wants them."""
+    kind = row[XYZ[0]]
+    if kind not in (np.dtype(np.float32), np.dtype(np.float64)) or any(row[name] != kind for name in XYZ):
+        return None
+    first, *others = (row.fields[name][1] for name in XYZ) if row.fields else (0,)
+    aligned = (first | row.itemsize) % kind.itemsize == 0
+    return (kind, first) if aligned and others == [first + kind.itemsize, first + 2 * kind.itemsize] else None
 
 
 def _fill(file: io.FileIO, target: memoryview) -> int:
