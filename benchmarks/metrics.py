@@ -168,6 +168,8 @@ METRICS: tuple[Metric, ...] = (
     Metric("files.laz_read", "LAZ read, over laspy's own", "x", 0.3),
     # The world
     Metric("world.reading", "`calibrate` of 120 HDL-32 frames, over reading them", "x", 0.3, 2.0, bound=_FRAMES),
+    Metric("world.cut", "of it, reading all frames and cutting the target out, on all cores", "x", 0.3),
+    Metric("world.least", "what cannot be left out: read, cut, select and fit once, all known before", "x", 0.3),
     Metric("world.kernels", "the same in a process that runs on and has loaded its kernels", "x", 0.3),
     Metric("world.open3d_reading", "`calibrate` of them, over Open3D's reading of the same files", "x", 0.4),
     # Growth
