@@ -27,7 +27,7 @@ def file_size(path: Path) -> int:
         If there is no such file, or if it is a folder, a pipe or a device.
     """
     try:
-        status = Path(path).stat()
+        status = (path if isinstance(path, Path) else Path(path)).stat()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise InputError(path, f"cannot be read: {reason}", expected="an existing file") from error

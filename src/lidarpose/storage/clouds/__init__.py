@@ -80,7 +80,6 @@ def look_at_points(path: Path, look: Callable[[NDArray[np.floating[Any]]], Resul
     InputError
         As `read_cloud` does.
     """
-    path = Path(path)
     lend = getattr(import_module(_format(path)), "lent", None)
     points = None
     if lend is not None:

@@ -24,14 +24,16 @@ def read_header_lines(path: Path, last: str) -> tuple[list[str], int]:
 
 def _lines_until(head: bytes, last: str) -> tuple[list[str], int] | None:
     """The lines up to the one whose first word is `last`, and where it ends; None if it is not there as a whole."""
-    lines: list[str] = []
-    start = 0
-    while (end := head.find(b"\n", start)) >= 0:
-        line = head[start:end].decode("latin-1").strip()
-        lines.append(line)
-        start = end + 1
-        if line.split(maxsplit=1)[:1] == [last]:
-            return lines, start
+    word, at = last.encode(), 0
+    # Most often it is found at once; where something else begins with the word, further down.
+    while (at := head.find(word, at)) >= 0:
+        begin, end = head.rfind(b"\n", 0, at) + 1, head.find(b"\n", at)
+        if end < 0:
+            return None
+        if head[begin:end].decode("latin-1").split(maxsplit=1)[:1] == [last]:
+            lines = head[:end].decode("latin-1").split("\n")
+            return [line.strip() for line in lines], end + 1
+        at += 1
     return None
 
 
