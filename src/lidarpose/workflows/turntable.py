@@ -6,7 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import chain, groupby
@@ -41,6 +41,9 @@ if TYPE_CHECKING:
 Step = Callable[[], None]
 """Called after each image or scan that is done, for a progress bar."""
 
+
+Meanwhile = Callable[[Mapping[str, "BoardDetection"]], object]
+"""What is done with the boards while others search images."""
 
 Batch = Sequence[TurntablePlace]
 """Places whose images are searched together."""
@@ -132,15 +135,18 @@ def calibrate_turntable(
         If the session does not determine the motion; the message says why, and what to record.
     """
     recorded: list[Mapping[str, Any]] = []
+    panel_poses: dict[str, tuple[PanelPose, ...]] = {}
 
-    def meanwhile() -> None:
+    def meanwhile(boards: Mapping[str, BoardDetection]) -> None:
         recorded.append(provenance() if callable(provenance) else provenance or {})
         _import_what_follows()
+        with suppress(UndeterminedError):  # which is raised again where it belongs
+            panel_poses.update(_panel_poses(session, boards))
 
     stated = (stated or StatedSense()).filled_from(session.stated)
     features = detect_features(session, step=step, meanwhile=meanwhile)
     try:
-        observations, fitted = assign_lines(session, features, first_panel=first_panel)
+        observations, fitted = assign_lines(session, features, first_panel=first_panel, panel_poses=panel_poses or None)
     except UndeterminedError as error:
         tried = _parts(session, features, first_panel)
         raise with_cause_named(error, session, features.places, features.left_out, *tried) from None
@@ -255,12 +261,12 @@ def _import_what_follows() -> None:
 
 
 def detect_features(
-    session: TurntableSession, *, step: Step | None = None, meanwhile: Callable[[], object] = lambda: None
+    session: TurntableSession, *, step: Step | None = None, meanwhile: Meanwhile = lambda boards: None
 ) -> DetectedFeatures:
     """Boards, stripes and scan lines of a session (sections 1.2 to 1.4), on all cores.
 
     Where this process may be forked, copies of it take their share of the places; the result is the same without.
-    `meanwhile` is called once, while others search or decode images.
+    `meanwhile` is called once, with the boards, while others search or decode images.
     """
     batches = _batches(session.places)
     copies = copies_allowed() if len(batches) >= LEAST_BATCHES else 0
@@ -283,7 +289,7 @@ def detect_features(
 
 
 def _detect_alone(
-    session: TurntableSession, batches: Sequence[Batch], step: Step | None, meanwhile: Callable[[], object]
+    session: TurntableSession, batches: Sequence[Batch], step: Step | None, meanwhile: Meanwhile
 ) -> _Detected:
     """Boards, scan lines and stripes by this process alone.
 
@@ -294,7 +300,7 @@ def _detect_alone(
     try:
         decoded = _decoded_ahead(executor, batches)
         boards, finders = _detect_boards(session)
-        meanwhile()
+        meanwhile(boards)
         lines = [_find_scan_lines(session, place) for batch in batches for place in batch]
         stripes: list[_Stripes] = []
         for batch in batches:
@@ -311,7 +317,7 @@ def _detect_with_copies(
     batches: Sequence[Batch],
     copies: int,
     step: Step | None,
-    meanwhile: Callable[[], object],
+    meanwhile: Meanwhile,
     stack: ExitStack,
 ) -> _Detected:
     """The same with the help of forked copies: scans while the boards are found, then images.
@@ -339,7 +345,13 @@ def _detect_with_copies(
         images = (place.stripe_image.load() for place in batches[k] if place.stripe_image is not None)
         return _find_stripes(finders[batches[k][0].placement], batches[k], images)
 
-    stripes = share(search, len(batches), copies=copies, first=meanwhile, done=lambda k: _advance(step, batches[k]))
+    stripes = share(
+        search,
+        len(batches),
+        copies=copies,
+        first=lambda: meanwhile(boards),
+        done=lambda k: _advance(step, batches[k]),
+    )
     return boards, list(chain(*lines)), list(chain(*stripes))
 
 
@@ -429,20 +441,34 @@ def _find_stripes(
 
 
 def assign_lines(
-    session: TurntableSession, features: DetectedFeatures, *, first_panel: int | None = None
+    session: TurntableSession,
+    features: DetectedFeatures,
+    *,
+    first_panel: int | None = None,
+    panel_poses: Mapping[str, tuple[PanelPose, ...]] | None = None,
 ) -> tuple[TurntableObservations, FittedBefore]:
-    """Decide by evidence which scan lines lie on which panels; with what was fitted for it."""
+    """Decide by evidence which scan lines lie on which panels; with what was fitted for it.
+
+    `panel_poses`: those of the boards, where they are known already.
+    """
     from lidarpose.solve.assignment import assign
-    from lidarpose.solve.paper import board_poses
 
     corners = {name: board.corners for name, board in features.boards.items()}
     unassigned = TurntableObservations(session.camera, session.panels, corners, (), session.lidar, features.left_out)
-    panel_poses = {name: board_poses(session.camera, corners[name], name) for name in corners}
+    if panel_poses is None:
+        panel_poses = _panel_poses(session, features.boards)
     assignment = assign(session.camera, panel_poses, features.places, panels=session.panels, first_panel=first_panel)
     left_out = merge_left_out(features.left_out, assignment.left_out)
     return replace(unassigned, places=assignment.places, left_out=left_out), FittedBefore(
         panel_poses, assignment.stripe_pairs
     )
+
+
+def _panel_poses(session: TurntableSession, boards: Mapping[str, BoardDetection]) -> dict[str, tuple[PanelPose, ...]]:
+    """The panels' poses by placement."""
+    from lidarpose.solve.paper import board_poses
+
+    return {name: board_poses(session.camera, board.corners, name) for name, board in boards.items()}
 
 
 def solve(observations: TurntableObservations, fitted: FittedBefore | None = None) -> PaperSolution:
