@@ -1,6 +1,7 @@
 """The small steps of `detect.cloud_planes` over a subsample, compiled by numba; imported only where they pay.
 
-Each is the NumPy way's; sums are taken in double precision in place of single.
+Each is the NumPy way's; sums are taken in double precision in place of single. Small arrays are filled by loops, which
+compile in a fraction of the time that assignments of slices and functions of NumPy take.
 """
 
 from __future__ import annotations
@@ -20,16 +21,18 @@ def _columns(points: Any) -> Any:
     """Points (N, 3) as x, y and z, filled up with infinity to a multiple of the groups."""
     n = -(-len(points) // _GROUPS) * _GROUPS
     x, y, z = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-    x[len(points) :] = y[len(points) :] = z[len(points) :] = np.inf
     for i in range(len(points)):
         x[i], y[i], z[i] = points[i, 0], points[i, 1], points[i, 2]
+    for i in range(len(points), n):
+        x[i] = y[i] = z[i] = np.inf
     return x, y, z
 
 
 @kernel
 def _squares(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any, squares: Any, least: Any) -> None:
     """Squared distances of points from (a, b, c), and the least in each group."""
-    least[:] = np.inf
+    for group in range(_GROUPS):
+        least[group] = np.inf
     for first in range(0, len(x), _GROUPS):
         for group in range(_GROUPS):
             i = np.uint64(first) + np.uint64(group)
@@ -84,7 +87,11 @@ def nearest(points: Any, seeds: Any, count: int) -> Any:
 @kernel
 def eigen(matrix: Any) -> Any:
     """Eigenvalues (3,), ascending, of a symmetric matrix (3, 3), and their vectors in columns: Jacobi's rotations."""
-    a, v = matrix.copy(), np.eye(3)
+    a, v = np.empty((3, 3)), np.zeros((3, 3))
+    for p in range(3):
+        v[p, p] = 1.0
+        for q in range(3):
+            a[p, q] = matrix[p, q]
     for _ in range(30):
         off = a[0, 1] ** 2 + a[0, 2] ** 2 + a[1, 2] ** 2
         if not off > 1e-36 * (a[0, 0] ** 2 + a[1, 1] ** 2 + a[2, 2] ** 2):
@@ -108,50 +115,23 @@ def eigen(matrix: Any) -> Any:
             a[p, p], a[q, q] = a[q, q], a[p, p]
             for k in range(3):
                 v[k, p], v[k, q] = v[k, q], v[k, p]
-    return np.array([a[0, 0], a[1, 1], a[2, 2]]), v
+    values = np.empty(3)
+    for k in range(3):
+        values[k] = a[k, k]
+    return values, v
 
 
 @kernel
-def local_planes(chosen: Any) -> Any:
-    """Planes (H, 4) through neighbourhoods (H, K, 3), and the variances (H, 3) of their points, ascending."""
-    hypotheses, count = chosen.shape[0], chosen.shape[1]
-    planes, variances = np.empty((hypotheses, 4)), np.empty((hypotheses, 3))
-    mean, second = np.empty(3), np.empty((3, 3))
-    for h in range(hypotheses):
-        mean[:] = 0.0
-        for j in range(count):
-            for i in range(3):
-                mean[i] += chosen[h, j, i]
-        mean /= count
-        second[:] = 0.0
-        for j in range(count):
-            p, q, r = chosen[h, j, 0] - mean[0], chosen[h, j, 1] - mean[1], chosen[h, j, 2] - mean[2]
-            second[0, 0] += p * p
-            second[0, 1] += p * q
-            second[0, 2] += p * r
-            second[1, 1] += q * q
-            second[1, 2] += q * r
-            second[2, 2] += r * r
-        second[1, 0], second[2, 0], second[2, 1] = second[0, 1], second[0, 2], second[1, 2]
-        values, vectors = eigen(second / count)
-        planes[h, :3] = vectors[:, 0]
-        planes[h, 3] = vectors[0, 0] * mean[0] + vectors[1, 0] * mean[1] + vectors[2, 0] * mean[2]
-        variances[h] = np.maximum(values, 0.0)
-    return planes, variances
-
-
-@kernel
-def _spacing(points: Any, members: Any) -> float:
-    """`plane_raster.spacing_m` of the points at the positions `members`."""
-    n = len(members)
-    if n < 4:
-        return 0.0
+def _covariance(points: Any, count: float) -> Any:
+    """Mean (3,) of points (N, 3), and the sums of their products around it over a count (3, 3)."""
     mean, second = np.zeros(3), np.zeros((3, 3))
-    for j in members:
+    n = len(points)
+    for j in range(n):
         for i in range(3):
             mean[i] += points[j, i]
-    mean /= n
-    for j in members:
+    for i in range(3):
+        mean[i] /= n
+    for j in range(n):
         p, q, r = points[j, 0] - mean[0], points[j, 1] - mean[1], points[j, 2] - mean[2]
         second[0, 0] += p * p
         second[0, 1] += p * q
@@ -159,41 +139,78 @@ def _spacing(points: Any, members: Any) -> float:
         second[1, 1] += q * q
         second[1, 2] += q * r
         second[2, 2] += r * r
-    second[1, 0], second[2, 0], second[2, 1] = second[0, 1], second[0, 2], second[1, 2]
-    variances = np.maximum(eigen(second / (n - 1))[0], 0.0)
-    return float(2.0 * (144.0 * variances[1] * variances[2]) ** 0.25 / np.sqrt(n))
+    for i in range(3):
+        for j in range(i, 3):
+            second[i, j] /= count
+            second[j, i] = second[i, j]
+    return mean, second
 
 
 @kernel
-def cell_size(points: Any, members: Any, least_gap: float, gap_per_range: float) -> float:
-    """`plane_raster.cell_size_m` of the points (S, 3) at the positions `members` (M,)."""
-    ranges = np.empty(len(members), np.float32)
-    for k in range(len(members)):
-        p, q, r = points[members[k], 0], points[members[k], 1], points[members[k], 2]
+def local_planes(chosen: Any) -> Any:
+    """Planes (H, 4) through neighbourhoods (H, K, 3), and the variances (H, 3) of their points, ascending."""
+    hypotheses = chosen.shape[0]
+    planes, variances = np.empty((hypotheses, 4)), np.empty((hypotheses, 3))
+    for h in range(hypotheses):
+        mean, second = _covariance(chosen[h], float(chosen.shape[1]))
+        values, vectors = eigen(second)
+        offset = 0.0
+        for i in range(3):
+            planes[h, i] = vectors[i, 0]
+            offset += vectors[i, 0] * mean[i]
+            variances[h, i] = max(values[i], 0.0)
+        planes[h, 3] = offset
+    return planes, variances
+
+
+@kernel
+def _spacing(points: Any) -> float:
+    """`plane_raster.spacing_m`."""
+    n = len(points)
+    if n < 4:
+        return 0.0
+    values = eigen(_covariance(points, n - 1.0)[1])[0]
+    area = 144.0 * max(values[1], 0.0) * max(values[2], 0.0)
+    return float(2.0 * area**0.25 / np.sqrt(n))
+
+
+@kernel
+def cell_size(points: Any, least_gap: float, gap_per_range: float) -> float:
+    """`plane_raster.cell_size_m`."""
+    ranges = np.empty(len(points), np.float32)
+    for k in range(len(points)):
+        p, q, r = points[k, 0], points[k, 1], points[k, 2]
         ranges[k] = np.sqrt(p * p + q * q + r * r)
     gap = max(least_gap, gap_per_range * float(np.median(ranges)))
-    return max(gap, _spacing(points, members))
+    return max(gap, _spacing(points))
 
 
 @kernel
 def largest_piece(points: Any, inside: Any, axes: Any, least_gap: float, gap_per_range: float, most_cells: int) -> Any:
     """Of the points (S, 3) that are `inside` (S,), those (S,) of the largest piece that hangs together on the plane
     with the axes (2, 3)."""
-    members = np.flatnonzero(inside)
     result = np.zeros(len(points), np.bool_)
-    n = len(members)
+    members, chosen = np.empty(len(points), np.int64), np.empty((len(points), 3), np.float32)
+    n = 0
+    for j in range(len(points)):
+        if inside[j]:
+            members[n] = j
+            for i in range(3):
+                chosen[n, i] = points[j, i]
+            n += 1
     if n == 0:
         return result
-    cell_m = cell_size(points, members, least_gap, gap_per_range)
-    across = (axes / cell_m).astype(np.float32)
-    along = np.empty((n, 2), np.int64)
-    for k in range(n):
-        x, y, z = points[members[k], 0], points[members[k], 1], points[members[k], 2]
-        for i in range(2):
-            along[k, i] = np.int64(np.floor(across[i, 0] * x + across[i, 1] * y + across[i, 2] * z))
-    low_u, low_v = along[:, 0].min(), along[:, 1].min()
-    height = min(along[:, 0].max() - low_u + 1, most_cells)
-    width = min(along[:, 1].max() - low_v + 1, most_cells)
+    cell_m = cell_size(chosen[:n], least_gap, gap_per_range)
+    along, low, high = np.empty((n, 2), np.int64), np.empty(2, np.int64), np.empty(2, np.int64)
+    for i in range(2):
+        a, b, c = np.float32(axes[i, 0] / cell_m), np.float32(axes[i, 1] / cell_m), np.float32(axes[i, 2] / cell_m)
+        for k in range(n):
+            cell = np.int64(np.floor(a * chosen[k, 0] + b * chosen[k, 1] + c * chosen[k, 2]))
+            along[k, i] = cell
+            low[i] = cell if k == 0 else min(low[i], cell)
+            high[i] = cell if k == 0 else max(high[i], cell)
+    low_u, low_v = low[0], low[1]
+    height, width = min(high[0] - low_u + 1, most_cells), min(high[1] - low_v + 1, most_cells)
     # A frame of empty cells, so that each has eight neighbours.
     line = width + 2
     count = np.zeros((height + 2) * line, np.int32)
@@ -204,7 +221,6 @@ def largest_piece(points: Any, inside: Any, axes: Any, least_gap: float, gap_per
         if cells[k] > 0:
             count[cells[k]] += 1
     label = np.zeros(len(count), np.int32)
-    steps = np.array([-line - 1, -line, -line + 1, -1, 1, line - 1, line, line + 1])
     stack = np.empty(len(count), np.int64)
     best = pieces = 0
     best_size = 0
@@ -219,8 +235,8 @@ def largest_piece(points: Any, inside: Any, axes: Any, least_gap: float, gap_per
             top -= 1
             cell = stack[top]
             size += count[cell]
-            for step in steps:
-                other = cell + step
+            for step in range(9):
+                other = cell + (step // 3 - 1) * line + step % 3 - 1
                 if count[other] > 0 and label[other] == 0:
                     label[other] = pieces
                     stack[top] = other
@@ -286,6 +302,12 @@ def moments(local: Any, inside: Any) -> Any:
         s_yy += y_in * y
         s_yz += y_in * z
         s_zz += z_in * z
-    mean = np.array([s_x, s_y, s_z]) / s_1
-    second = np.array([[s_xx, s_xy, s_xz], [s_xy, s_yy, s_yz], [s_xz, s_yz, s_zz]]) / s_1
-    return mean, second - np.outer(mean, mean)
+    mean, second = np.empty(3), np.empty((3, 3))
+    mean[0], mean[1], mean[2] = s_x / s_1, s_y / s_1, s_z / s_1
+    second[0, 0], second[1, 1], second[2, 2] = s_xx, s_yy, s_zz
+    second[0, 1], second[0, 2], second[1, 2] = s_xy, s_xz, s_yz
+    second[1, 0], second[2, 0], second[2, 1] = s_xy, s_xz, s_yz
+    for i in range(3):
+        for j in range(3):
+            second[i, j] = second[i, j] / s_1 - mean[i] * mean[j]
+    return mean, second

@@ -171,7 +171,10 @@ def claims_of_block(points: Any, free: Any, rows: Any, allowed: Any, starts: Any
             disputes += np.uint64(times[np.uint64(held[np.uint64(j)])] > 1)
         mine = slice(first, ends[k])
         theirs = disputed[begun : int(disputes)]
-        sums[k] = moments_of(height[mine], along_u[mine], along_v[mine], theirs, level, gates[k])
+        of_slab = moments_of(height[mine], along_u[mine], along_v[mine], theirs, level, gates[k])
+        for i in range(4):
+            for j in range(4):
+                sums[k, i, j] = of_slab[i, j]
         first, disputed_ends[k] = ends[k], disputes
     return held, height, along_u, along_v, ends, disputed[: int(disputes)].copy(), disputed_ends, sums
 
@@ -179,7 +182,8 @@ def claims_of_block(points: Any, free: Any, rows: Any, allowed: Any, starts: Any
 @kernel
 def _longer(values: Any, size: int) -> Any:
     more = np.empty(size, values.dtype)
-    more[: len(values)] = values
+    for i in range(len(values)):
+        more[i] = values[i]
     return more
 
 
