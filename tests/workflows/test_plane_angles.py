@@ -74,9 +74,12 @@ def test_what_turns_everything_alike_costs_no_angle() -> None:
     covariance = np.zeros((10, 10))
     exact = TurntableCalibration(TurntableMotion(Pose.identity(), lidar), covariance)
     turned = TurntableCalibration(exact.motion, np.diag([0.1] * 3 + [0.05] * 3 + [0.0] * 4) ** 2)
-    views = [view_of_recording(recording, calibration) for calibration in (exact, turned)]
+    unknown = TurntableCalibration(exact.motion)
+    views = [view_of_recording(recording, calibration) for calibration in (exact, turned, unknown)]
     sigma = [plane_angle_sigmas(view, measure_planes(view)) for view in views]
     np.testing.assert_allclose(sigma[1], sigma[0], atol=1e-6)
+    np.testing.assert_allclose(sigma[2], sigma[0], atol=1e-6)
+    assert any("no covariance" in remark for remark in views[2].remarks)
     (cloud,) = assemble_scan(recording, exact, points_per_part=10**9)
     of_cloud = view_of_cloud(cloud, None)
     assert plane_angle_sigmas(of_cloud, measure_planes(of_cloud)).max() < 0.5

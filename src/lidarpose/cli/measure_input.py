@@ -26,7 +26,7 @@ def measurement_view(source: Path, calibration: Path | None, never_stops: bool) 
             "CALIBRATION",
             "is missing",
             expected="the turntable's calibration file after the recording",
-            remedy=f"For example: lidarpose measure disk {source} calibration.json",
+            remedy=f"For example: lidarpose measure ... {source} calibration.json",
         )
     if never_stops and not recording.has_reading_per_beam:
         recording = with_readings_between(recording)

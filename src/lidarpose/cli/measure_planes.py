@@ -94,7 +94,8 @@ def _print(planes: list[MeasuredPlane], angles: FloatArray, sigmas: FloatArray, 
     if count < 2:
         return
     more = "" if count == len(planes) else f" of the {count} largest; --json has all"
-    between = Table(box=SIMPLE_HEAD, title=f"Angles and their standard deviations, deg{more}", title_justify="left")
+    out().print(f"Angles and their standard deviations, deg{more}")
+    between = Table(box=SIMPLE_HEAD)
     for column in ("", *map(str, range(count - 1))):
         between.add_column(column, justify="right", no_wrap=True)
     for k in range(1, count):

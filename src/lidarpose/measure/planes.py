@@ -84,8 +84,10 @@ def plane_angle_sigmas_deg(
         How points move with a calibration's parameters, and the covariance (p, p) of these. All planes share its
         errors, which cancel as far as they turn both planes of a pair alike. None: without the calibration's share.
     """
-    C = np.zeros((0, 0)) if covariance is None else covariance
-    moved = [np.zeros((3, len(C))) if shifts is None else _normal_shift(p, points, shifts) for p in planes]
+    C: FloatArray = np.zeros((0, 0))
+    moved: list[FloatArray] = [np.zeros((3, 0)) for _ in planes]
+    if shifts is not None and covariance is not None:
+        C, moved = covariance, [_normal_shift(p, points, shifts) for p in planes]
     sigma = np.zeros((len(planes), len(planes)))
     for i, one in enumerate(planes):
         for j, other in enumerate(planes[:i]):
