@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
 from typing import TypeVar
+
+import numpy as np
 
 # Arrays of fewer elements are done with before a thread is waited for.
 LARGE = 4000
@@ -21,3 +27,40 @@ def each(work: Callable[[Item], Result], items: Sequence[Item], elements: int) -
         return [work(item) for item in items]
     with ThreadPoolExecutor(cores) as pool:
         return list(pool.map(work, items))
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """NumPy's OpenBLAS without threads of its own; nothing where NumPy stands on another library.
+
+    For work of many products of some thousand numbers: OpenBLAS shares out even these, and its threads then wait for
+    the next one in a loop, on cores that others could use. Holds for the whole process while the block runs.
+    """
+    counters = _openblas()
+    if counters is None:
+        yield
+        return
+    get, put = counters
+    before = get()
+    put(1)
+    try:
+        yield
+    finally:
+        put(before)
+
+
+@lru_cache(maxsize=1)
+def _openblas() -> tuple[Callable[[], int], Callable[[int], None]] | None:
+    """How to ask for and set the number of threads of the OpenBLAS in NumPy's wheels."""
+    folder = Path(np.__file__).parents[1] / "numpy.libs"
+    for path in sorted(folder.glob("*openblas*")):
+        try:
+            library = ctypes.CDLL(str(path))
+        except OSError:
+            continue
+        for name in ("scipy_openblas", "openblas"):
+            get = getattr(library, f"{name}_get_num_threads64_", None)
+            put = getattr(library, f"{name}_set_num_threads64_", None)
+            if get is not None and put is not None:
+                return get, put
+    return None

@@ -13,7 +13,7 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.robust import box_plot_inliers
 from lidarpose.geometry.se3 import Pose
-from lidarpose.geometry.threads import each
+from lidarpose.geometry.threads import each, one_blas_thread
 from lidarpose.model.calibration import WorldCalibration
 from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import CornerSession
@@ -97,6 +97,11 @@ def locate_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda:
         If no corner, or more than one, moves as the world coordinates say.
     """
     session = with_scans(session)
+    with one_blas_thread():
+        return _located(session, seed, tick)
+
+
+def _located(session: CornerSession, seed: int, tick: Tick) -> LocatedTarget:
     found = find_target(session, seed=seed, tick=tick)
     if found.ambiguous:
         raise UndeterminedError(
@@ -177,10 +182,11 @@ def world_run(
     if found.by_edges and method != "joint":
         raise _two_faces()
     limits = PrecisionLimits(**(wishes or {}))
-    if method == "joint":
-        run = _joint_with_all_faces(session, located, scale_too, limits)
-    else:
-        run = _cornerwise(session, found, crops, method, scale_too, limits, seed)
+    with one_blas_thread():
+        if method == "joint":
+            run = _joint_with_all_faces(session, located, scale_too, limits)
+        else:
+            run = _cornerwise(session, found, crops, method, scale_too, limits, seed)
     recorded = {**(provenance or {}), **run.calibration.provenance}
     return replace(run, calibration=replace(run.calibration, provenance=recorded))
 
