@@ -436,7 +436,23 @@ def fit_place(crop: PlaceCrop, sighting: CornerCandidate, sigma_m: float) -> Fre
     return fit if np.linalg.norm(corner - sighting.corner) < CROP_MARGIN_M else None
 
 
-def _reaches_both_ways(faces: dict[int, FaceReturns]) -> bool:
+def observe_inner(
+    session: CornerSession,
+    found: FoundTarget,
+    crops: Sequence[PlaceCrop],
+    corners: FloatArray,
+    normals: FloatArray,
+    sigma_m: float,
+) -> list[CornerPlaceFaces]:
+    """Returns of the faces' parts next to the corner, which are surely of the target; of whole faces where scan lines
+    are too few for that."""
+    places, _ = observe(session, found, crops, corners, normals, sigma_m, INNER_SHARE)
+    if all(len(place.faces) == 3 and _reaches_both_ways(place.faces) for place in places):
+        return places
+    return observe(session, found, crops, corners, normals, sigma_m)[0]
+
+
+def _reaches_both_ways(faces: Mapping[int, FaceReturns]) -> bool:
     """Whether each face's returns are spread over two directions, not along one scan line."""
     for returns in faces.values():
         spread = np.linalg.svd(returns.directions - returns.directions.mean(axis=0), compute_uv=False)
@@ -452,14 +468,18 @@ def observe(
     corners: FloatArray,
     normals: FloatArray,
     sigma_m: float,
+    share: float = 1.0,
 ) -> tuple[list[CornerPlaceFaces], list[LeftOut]]:
-    """Returns of the faces at each place, selected by common normals; what is left out, and why."""
+    """Returns of the faces at each place, selected by common normals; what is left out, and why.
+
+    With `share` below 1, only of the faces' parts next to the corner.
+    """
     places, left_out = [], []
     reference = max((s for s in found.sightings if s is not None), key=lambda s: s.support)
 
     def select(task: tuple[CornerCandidate | None, PlaceCrop, FloatArray]) -> dict[int, FaceReturns]:
         sighting, crop, corner = task
-        mask = mask_of(sighting or reference, corner, normals)
+        mask = mask_of(sighting or reference, corner, normals, share)
         return select_faces(crop, mask, GATE_SIGMAS * sigma_m, sigma_m)
 
     tasks = list(zip(found.sightings, crops, corners, strict=True))

@@ -51,6 +51,7 @@ from lidarpose.workflows.corner_target import (
     fit_place,
     gather,
     observe,
+    observe_inner,
 )
 from lidarpose.workflows.recorded_corners import with_scans
 from lidarpose.workflows.thin_face import with_thin_face
@@ -258,14 +259,18 @@ def _joint(
     fits = _place_fits(session, found, few) if alone else [None] * len(few)
     start, sigma_m = _start(mended, found, fits)
     corners = _corners(start, fits, found, sighted=not alone)
-    places, _ = observe(mended, found, few, corners, start.normals, sigma_m)
+    places = observe_inner(mended, found, few, corners, start.normals, sigma_m)
     fit, first = _fit(mended, places, start, sigma_m, scale_too, FIRST_SETTLED)
     # Then from all, with the faces' beams selected by the estimate itself.
     corners = _expected(fit, places, found.world)
     observed, left_out = observe(mended, found, crops, corners, fit.state.normals, fit.range_sigma_m)
     by_frame = _corners_by_frame(observed, corners, fit)
     places, frame_scatter, dropped = _without_odd_frames(observed, by_frame)
-    places = without_rims(places, fit.state.normals, corners, fit.range_sigma_m, _common_error(fit, first, places))
+    # Where faces end is told to a fraction of the noise, which the first estimate does not reach.
+    common_error = _common_error(fit, first, places)
+    fit, _ = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too, FIRST_SETTLED)
+    corners = _expected(fit, places, found.world)
+    places = without_rims(places, fit.state.normals, corners, fit.range_sigma_m, common_error)
     fit, used = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too)
     fit, used, offsets, crossing = _without_ring_offsets(mended, fit, used)
     scatter = spot_scatter(fit, used)
