@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -261,7 +262,7 @@ class FaceMask:
     def _select_compiled(self, rays: FloatArray, range_m: FloatArray, gate_m: float) -> tuple[IntArray, IntArray]:
         from lidarpose.detect.target_kernels import faces_met
 
-        edges = [_edges(o, n, RIM_M) for o, n in zip(self.outlines, self.normals, strict=True)]
+        edges = [(inward, least - RIM_M) for inward, least in self._edges_of]
         planes = np.array([[*plane.normal, plane.offset] for plane in self.obstacles]).reshape(-1, 4)
         found = faces_met(
             rays,
@@ -283,7 +284,13 @@ class FaceMask:
     def on_rim(self, face: int, rays: FloatArray) -> BoolArray:
         """Which rays (3, N) to a face pass outside its outline, within its rim."""
         normal = self.normals[face]
-        return ~in_outline(rays * ((normal @ self.corner) / (normal @ rays)), self.outlines[face], normal, 0.0)
+        inward, least = self._edges_of[face]
+        return np.asarray((inward @ (rays * ((normal @ self.corner) / (normal @ rays))) <= least[:, None]).any(axis=0))
+
+    @cached_property
+    def _edges_of(self) -> list[tuple[FloatArray, FloatArray]]:
+        """By face: its outline's edges (see `_edges`)."""
+        return [_edges(o, n, 0.0) for o, n in zip(self.outlines, self.normals, strict=True)]
 
     def _off_edge_m(self, face: int, other: int) -> float:
         """How far a face's points have to be from another's plane to be off their common edge."""
@@ -323,14 +330,14 @@ class FaceMask:
 
         `height` (3, N) are their projections onto the three normals.
         """
-        normal = self.normals[face]
-        good = in_outline(on_face, self.outlines[face], normal, RIM_M)
+        inward, least = self._edges_of[face]
+        good = (inward @ on_face > least[:, None] - RIM_M).all(axis=0)
         for k in range(3):
             if k != face:
                 good &= np.abs(height[k] - self.normals[k] @ self.corner) > self._off_edge_m(face, k)
         for plane in self.obstacles:
             good &= plane.normal @ on_face - plane.offset > self._off_obstacle_m(face, plane)
-        return good
+        return np.asarray(good)
 
 
 def in_outline(points: FloatArray, outline: FloatArray, normal: FloatArray, slack_m: float) -> BoolArray:
@@ -344,7 +351,7 @@ def _edges(outline: FloatArray, normal: FloatArray, slack_m: float) -> tuple[Flo
     x, y, z = (np.concatenate([outline[1:], outline[:1]]) - outline).T
     a, b, c = normal
     inward = np.column_stack([b * z - c * y, c * x - a * z, a * y - b * x])
-    length = np.linalg.norm(inward, axis=1)
-    keep = length > 1e-9
-    inward = inward[keep] / length[keep, None]
-    return inward, np.einsum("ij,ij->i", inward, outline[keep]) - slack_m
+    length = np.sqrt(np.einsum("ij,ij->i", inward, inward))
+    keep = np.flatnonzero(length > 1e-9)
+    inward = inward.take(keep, axis=0) / length.take(keep)[:, None]
+    return inward, np.einsum("ij,ij->i", inward, outline.take(keep, axis=0)) - slack_m

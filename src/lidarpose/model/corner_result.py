@@ -70,7 +70,7 @@ class FaceReturns:
 
     def subset(self, index: IntArray) -> FaceReturns:
         """Those of the returns that `index` (M,), ascending, tells."""
-        return FaceReturns(self.rays.take(index, axis=1).T, self.range_m[index], self.frame[index])
+        return FaceReturns(self.rays.take(index, axis=1).T, self.range_m.take(index), self.frame.take(index))
 
 
 @dataclass(frozen=True, eq=False)
