@@ -122,3 +122,11 @@ def test_a_crossing_is_for_clouds_of_a_multi_beam_lidar(folder: Path) -> None:
     file.write_text(text + "beam_crossing_m = 0.0419\n")
     with pytest.raises(InputError, match="beam_crossing_m"):
         read_corner_session(folder)
+
+
+@pytest.mark.parametrize("value", ["41.9", "-0.3", "nan", "inf", '"x"', "true", "[0.04]"])
+def test_an_absurd_crossing_is_refused(folder: Path, value: str) -> None:
+    file = folder / "session.toml"
+    file.write_text(file.read_text() + f"beam_crossing_m = {value}\n")
+    with pytest.raises(InputError, match=r"session\.toml: lidar\.beam_crossing_m: "):
+        read_corner_session(folder)

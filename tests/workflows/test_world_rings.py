@@ -58,6 +58,10 @@ def test_beams_that_cross_are_noticed_and_not_moved_unasked() -> None:
     assert straight.quality is not None
     assert straight.quality.verdict == "good"
     assert abs(straight.quality.figures["beam_crossing_left_out_mm"]["value"]) < 10.0
+    # Stated where there is none it is found out, too.
+    stated = world_run(put_to_their_starts(simulate_corner_session(spec)[0])).calibration
+    assert stated.quality is not None
+    assert any("nearer to its axis" in reason for reason in stated.quality.reasons)
     crossing, truth = simulate_corner_session(replace(spec, beam_crossing_m=CROSSING_M))
     offsets = np.random.default_rng(4).normal(0.0, 0.005, 16)
     for session in (crossing, with_lines_off(crossing, offsets)):

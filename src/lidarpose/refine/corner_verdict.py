@@ -118,12 +118,19 @@ def judge_corner_fit(
 
 
 def _judge_crossing(verdict: _Verdict, seen: SeenCrossing) -> None:
-    if seen.told:
+    if not seen.told:
+        return
+    far, sigma = 1e3 * abs(seen.crossing_m), 1e3 * seen.sigma_m
+    if seen.crossing_m > 0.0:
         verdict.doubt(
-            f"the LiDAR's beams seem to cross {1e3 * seen.crossing_m:.0f} mm (standard deviation "
-            f"{1e3 * seen.sigma_m:.0f}) before its axis, beyond what the clouds hold: its driver may let all beams "
-            "start at one point; state the distance of the maker's manual as beam_crossing_m under [lidar] "
-            "(VLP-16: 0.0419)"
+            f"the LiDAR's beams seem to cross {far:.0f} mm (standard deviation {sigma:.0f}) before its axis, beyond "
+            "what the clouds hold: its driver may let all beams start at one point; state the distance of the maker's "
+            "manual as beam_crossing_m under [lidar] (VLP-16: 0.0419)"
+        )
+    else:
+        verdict.doubt(
+            f"the LiDAR's beams seem to cross {far:.0f} mm (standard deviation {sigma:.0f}) nearer to its axis, or "
+            "farther behind it, than the clouds hold: correct beam_crossing_m under [lidar], or leave it out"
         )
 
 

@@ -38,13 +38,15 @@ MAX_PLACES = 10_000
 MAX_WORLD_M = 1e7
 
 _WORLD = ("world_x_m", "world_y_m", "world_z_m")
+# The lenses sit within the instrument.
+_LARGEST_CROSSING_M = 0.2
 _NEAR = ("near_x_m", "near_y_m", "near_z_m")
 
 
 class _LidarSection(LidarSection):
     """[lidar] of a corner session."""
 
-    beam_crossing_m: Annotated[float, Field(gt=-0.2, lt=0.2)] | None = None
+    beam_crossing_m: float | None = None
 
     def spec(self) -> LidarSpec:
         return replace(super().spec(), beam_crossing_m=self.beam_crossing_m)
@@ -119,6 +121,13 @@ def read_corner_session(folder: Path) -> CornerSession:
     cloud_frame, turntable = _recorded(folder, file, document, places)
     crossing_m = document.lidar.beam_crossing_m
     if crossing_m:
+        if not abs(crossing_m) < _LARGEST_CROSSING_M:
+            raise InputError(
+                file,
+                f"is {crossing_m:g}",
+                field="lidar.beam_crossing_m",
+                expected=f"metres, between -{_LARGEST_CROSSING_M:g} and {_LARGEST_CROSSING_M:g} (a VLP-16's is 0.0419)",
+            )
         if cloud_frame != "lidar":
             raise InputError(
                 file,
