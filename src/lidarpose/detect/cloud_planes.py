@@ -307,8 +307,9 @@ def _draw(
     if count < MANY_HYPOTHESES:
         chosen = np.concatenate([draw.points() for draw in draws])
     else:
-        with ThreadPoolExecutor(len(draws)) as pool:
-            chosen = np.concatenate(list(pool.map(_Neighbourhoods.points, draws)))
+        with ThreadPoolExecutor(1) as pool:
+            others = [pool.submit(draw.points) for draw in draws[1:]]
+            chosen = np.concatenate([draws[0].points(), *(other.result() for other in others)])
     seeds = np.concatenate([draw.cloud[draw.seeds] for draw in draws])
     planes, variances = _local_planes(chosen)
     flat = variances[:, 1] > 0.01 * variances[:, 2]

@@ -13,7 +13,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from typing import Protocol
+from itertools import count
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from lidarpose.geometry.robust import mad_sigma
 from lidarpose.model.plane_patch import PlanePatch
 
 Float32Array = NDArray[np.float32]
+Result = TypeVar("Result")
 
 # Points of a block, at most: its coordinates, heights and masks stay in a core's cache.
 BLOCK = 64_000
@@ -301,6 +303,39 @@ class Claim:
         return np.concatenate([claims.some(held // EVIDENCE_POINTS + 1) for claims, _ in self.parts])
 
 
+class _Team:
+    """As many threads as cores, this one among them: each takes the next piece of work.
+
+    A pool's own map has this thread wait for every piece, and wake for it: for 700 000 points by NumPy ten times as
+    often.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._others = min(os.cpu_count() or 1, most) - 1
+        self._pool = ThreadPoolExecutor(max(self._others, 1))
+
+    def __enter__(self) -> _Team:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._pool.shutdown()
+
+    def each(self, work: Callable[..., Result], *pieces: Sequence[Any]) -> list[Result]:
+        """As the built-in map, in a list."""
+        done: dict[int, Result] = {}
+        numbers = count()
+
+        def take() -> None:
+            while (k := next(numbers)) < len(pieces[0]):
+                done[k] = work(*(of[k] for of in pieces))
+
+        others = [self._pool.submit(take) for _ in range(self._others)]
+        take()
+        for other in others:
+            other.result()
+        return [done[k] for k in range(len(pieces[0]))]
+
+
 def _blocks(x: NDArray[np.floating]) -> list[slice]:
     """An even number of blocks, all alike, for two cores to be busy equally long."""
     each = -(-len(x) // (2 * -(-len(x) // (2 * BLOCK)))) if len(x) else 1
@@ -328,17 +363,16 @@ def patches_of_slabs(
     For each slab its patch; None where too few points are there. No point belongs to two.
     """
     blocks = _blocks(x)
-    workers = min(os.cpu_count() or 1, len(blocks))
     compiled = pays(SAVED_S_PER_POINT * len(x), "detect.plane_kernels")
     claim = _compiled_claims(x, free, slabs) if compiled else partial(_claim, x, free, slabs)
     members_in = _members_compiled if compiled else _members
-    with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(claim, blocks))
-        of_slabs = list(pool.map(_screened, slabs, ([part[k] for part in parts] for k in range(len(slabs)))))
-        fits = list(pool.map(lambda slab, mine: _fit(slab, mine, widest_m), slabs, of_slabs))
-        of_blocks = zip(*of_slabs, strict=True)
-        members = list(pool.map(lambda block, part: members_in(block, part, fits), blocks, of_blocks))
-        indices = list(pool.map(np.concatenate, zip(*members, strict=True)))
+    with _Team(len(blocks)) as team:
+        parts = team.each(claim, blocks)
+        of_slabs = team.each(_screened, slabs, [[part[k] for part in parts] for k in range(len(slabs))])
+        fits = team.each(lambda slab, mine: _fit(slab, mine, widest_m), slabs, of_slabs)
+        of_blocks = list(zip(*of_slabs, strict=True))
+        members = team.each(lambda block, part: members_in(block, part, fits), blocks, of_blocks)
+        indices = team.each(np.concatenate, list(zip(*members, strict=True)))
     patches: list[Claim | None] = []
     for k, fit in enumerate(fits):
         if fit is None:
