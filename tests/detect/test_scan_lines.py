@@ -105,6 +105,23 @@ def test_both_panels_are_found_whole_and_nothing_foreign_in_them(sigma: float) -
     assert 0.93 < np.mean(ratios) < 1.07
 
 
+@pytest.mark.parametrize("sweeps", [2, 4])
+def test_an_even_number_of_sweeps_is_averaged_too(sweeps: int) -> None:
+    rng = np.random.default_rng(5)
+    angles = np.deg2rad(np.arange(60.0, 120.0, 0.25))
+    true = 2.0 / np.sin(angles)
+    scan = Scan(
+        np.tile(angles, sweeps),
+        np.tile(true, sweeps) + rng.normal(0.0, 0.002, sweeps * len(angles)),
+        sweep=np.repeat(np.arange(sweeps), len(angles)),
+    )
+    merged = merge_sweeps(scan)
+    assert len(merged) > 0.97 * len(angles)
+    assert np.median(merged.count) == sweeps
+    (line,) = find_lines(scan)
+    assert np.median(line.sigma_m) == pytest.approx(0.002 / np.sqrt(sweeps), rel=0.2)
+
+
 def test_sweeps_are_averaged_and_their_sigma_falls_with_their_number() -> None:
     rng = np.random.default_rng(3)
     room, angles = draw_room(rng), np.deg2rad(np.arange(-90, 90, 0.25))

@@ -188,17 +188,19 @@ def merge_sweeps(scan: Scan) -> Beams:
     count = np.diff(np.append(starts, len(angle)))
     group = np.repeat(np.arange(len(starts)), count)
     by_range = np.lexsort((ranges, group))
-    middle = ranges[by_range][starts + (count - 1) // 2]
+    # Of an even number the mean of both in the middle: the lower of two would leave half of all distances zero.
+    ordered = ranges[by_range]
+    middle = 0.5 * (ordered[starts + (count - 1) // 2] + ordered[starts + count // 2])
     off = np.abs(ranges - middle[group])
     spread = median(off[count[group] > 1]) * 1.6 if np.any(count > 1) else 0.0
     near = off <= max(5.0 * spread, 1e-9)
     kept = np.bincount(group, near)
-    mean = np.bincount(group, np.where(near, ranges, 0.0)) / kept
+    mean = np.bincount(group, np.where(near, ranges, 0.0)) / np.maximum(kept, 1.0)
     steady = kept >= 0.6 * count
     mean_angle = np.bincount(group, angle) / count
     merged = None
     if intensity is not None:
-        merged = (np.bincount(group, np.where(near, intensity, 0.0)) / kept)[steady]
+        merged = (np.bincount(group, np.where(near, intensity, 0.0)) / np.maximum(kept, 1.0))[steady]
     return _from_a_gap(Beams(mean_angle[steady], mean[steady], kept[steady].astype(np.int64), merged))
 
 
