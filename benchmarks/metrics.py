@@ -65,9 +65,10 @@ _PLANES = (
     "all points, on all cores; the table has that pass alone, and the mere reading of all points. Without kernels "
     "these are 3, 4 and 20. Tried: bits for votes, kernels for the pass and for the testing, terms of what patches "
     "claim kept from the pass for all that follows, brute force in place of trees for neighbours (no sooner for 200 "
-    "of 4096 points), vector instructions for the claims' terms (3 % of the pass), other sizes of blocks. Clouds of "
-    "less than 200 k points are searched whole: 60 k take 17 ms, without kernels 23, of which a third goes to a "
-    "thousand hypotheses."
+    "of 4096 points), vector instructions for the claims' terms (3 % of the pass), other sizes of blocks, threads "
+    "that take blocks themselves in place of a pool that is waited for (a tenth of the wakes). Clouds of less than "
+    "200 k points are searched whole: 60 k take 17 ms, without kernels 23, of which a third goes to a thousand "
+    "hypotheses."
 )
 
 _STRIPES = (

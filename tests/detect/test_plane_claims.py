@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from lidarpose.detect.plane_claims import Claim, Slab, patches_of_slabs
+from lidarpose.detect.plane_claims import Claim, Slab, _Team, patches_of_slabs
 from lidarpose.geometry import compiled
 from lidarpose.geometry.arrays import BoolArray, FloatArray, angle_between
 from lidarpose.geometry.planes import Plane, fit_plane
@@ -108,3 +108,12 @@ def test_what_lies_beside_the_patch_on_its_plane_is_not_of_it() -> None:
     answer = claims(points, None, [rough(points[:30_000], 6)])[0]
     assert answer is not None
     assert answer.patch.indices.max() < 30_000
+
+
+def test_every_piece_of_work_is_done_once_and_an_error_in_any_thread_is_raised() -> None:
+    with _Team(4) as team:
+        assert team.each(lambda a, b: a - b, range(100), range(0, 200, 2)) == [-k for k in range(100)]
+        assert team.each(abs, []) == []
+        for wrong in range(4):
+            with pytest.raises(ZeroDivisionError):
+                team.each(lambda k, wrong=wrong: 1 // (k - wrong), range(4))
