@@ -14,6 +14,7 @@ from benchmarks.report import Cell, Effort, Report, Table
 from benchmarks.suites.files import touched
 from benchmarks.timing import beside
 from lidarpose.geometry.compiled import forced, installed
+from lidarpose.geometry.threads import one_blas_thread
 from lidarpose.model.corner_session import CornerSession
 from lidarpose.refine.corner_model import CornerState, fit_corner_model
 from lidarpose.simulate.corner_scene import CornerSceneSpec, simulate_corner_session
@@ -43,7 +44,12 @@ def run(effort: Effort) -> Report:
     text = f"{PLACES} places, {frames} frames each, {points} points in all; the answer is {1e3 * metres:.2f} mm off."
     rows: list[list[Cell]] = [["reading the frames", found.reference_s, 1.0]]
     rows += [[name, value, found.over[name]] for name, value in found.seconds.items()]
-    figures = {"world.reading": found.over[FIRST], "world.cut": found.over[CUT], "world.least": found.over[LEAST]}
+    figures = {
+        "world.reading": found.over[FIRST],
+        "world.find": found.over[FIND],
+        "world.cut": found.over[CUT],
+        "world.least": found.over[LEAST],
+    }
     if KERNELS in found.over:
         figures["world.kernels"] = found.over[KERNELS]
     if OPEN3D in found.over:
@@ -92,7 +98,7 @@ def _parts(folder: Path) -> dict[str, Callable[[], object]]:
 
 
 def _by_numpy(work: Callable[[], object]) -> object:
-    with forced(False):
+    with forced(False), one_blas_thread():
         return work()
 
 
