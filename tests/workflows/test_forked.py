@@ -150,7 +150,6 @@ def test_a_system_that_forks_no_more_costs_time_only() -> None:
         raise BlockingIOError("no more processes")
     os.fork = refuse
     assert share(lambda k: k, 5, copies=2) == list(range(5))
-    assert copies_allowed() == 0
     """)
 
 
@@ -203,6 +202,26 @@ def test_threads_that_python_does_not_know_are_seen() -> None:
     """)
 
 
+@TWO_CORES
+def test_nothing_is_shared_beside_threads_that_python_does_not_know() -> None:
+    run("""
+    import ctypes
+    c = ctypes.CDLL(None)
+    thread = ctypes.c_ulong()
+    # A thread of the C library's own that sleeps.
+    entry = ctypes.cast(c.pause, ctypes.c_void_p)
+    assert c.pthread_create(ctypes.byref(thread), None, entry, None) == 0
+    assert forked.copies_likely() > 0 and copies_allowed() == 0
+    begun = []
+    try:
+        share(lambda k: k, 5, copies=1, first=lambda: begun.append(1), done=begun.append)
+    except forked.NotAloneError:
+        assert not begun
+    else:
+        raise SystemExit("shared beside a thread")
+    """)
+
+
 def test_detection_is_the_same_with_and_without_copies(simulated_session: Path) -> None:
     run(
         """
@@ -214,13 +233,17 @@ def test_detection_is_the_same_with_and_without_copies(simulated_session: Path) 
     turntable.IMAGES_AT_ONCE = 2
     found, steps = [], []
     for copies in (0, 1):
-        turntable.copies_allowed = lambda: copies
+        turntable.copies_likely = lambda: copies
         found.append(turntable.detect_features(session, step=lambda: steps.append(copies)))
-    assert len(found[0].places) >= 5 and steps == [0] * len(session.places) + [1] * len(session.places)
+    def refused(*arguments, **options):
+        raise forked.NotAloneError
+    turntable.share = refused
+    found.append(turntable.detect_features(session, step=lambda: steps.append(2)))
+    assert len(found[0].places) >= 5 and steps == [k for k in range(3) for _ in session.places]
     assert not found[0].left_out
     def parts(features):
         return [pickle.dumps(part) for place in features.places for part in (*place.stripes.values(), *place.lines)]
-    assert parts(found[0]) == parts(found[1])
+    assert parts(found[0]) == parts(found[1]) == parts(found[2])
     files = len(os.listdir("/proc/self/fd"))
     """,
         simulated_session,
@@ -243,7 +266,7 @@ def test_a_broken_image_is_told_the_same_way_with_copies(simulated_session: Path
     turntable.IMAGES_AT_ONCE = 1
     told = []
     for copies in (0, 1):
-        turntable.copies_allowed = lambda: copies
+        turntable.copies_likely = lambda: copies
         try:
             turntable.detect_features(session)
         except InputError as error:

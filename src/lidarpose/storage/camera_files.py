@@ -11,7 +11,7 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.camera import Camera, DistortionModel
-from lidarpose.storage.camera_info import read_camera_info
+from lidarpose.storage.camera_info import camera_of_info
 from lidarpose.storage.documents import MAX_XML_BYTES, read_opencv_xml, read_text, read_yaml, shown
 
 _KINDS = "a ROS camera_info, OpenCV (camera_matrix, distortion_coefficients) or Kalibr camchain file"
@@ -49,7 +49,7 @@ def read_camera(path: Path) -> Camera:
         return _kalibr(path, document)
     if text.startswith("%YAML:") or "!!opencv-matrix" in text:
         return _opencv(path, document)
-    return read_camera_info(path)
+    return camera_of_info(path, document)
 
 
 def _opencv(path: Path, document: Mapping[str, Any]) -> Camera:

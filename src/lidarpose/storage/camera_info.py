@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,11 @@ def read_camera_info(path: Path) -> Camera:
     document = read_yaml(path)
     if not isinstance(document, dict):
         raise InputError(path, "holds no keys", expected="a ROS camera_info file")
+    return camera_of_info(path, document)
+
+
+def camera_of_info(path: Path, document: Mapping[Any, Any]) -> Camera:
+    """The camera of a camera_info that has been read from a file. Raises as `read_camera_info` does."""
     lowered = {str(key).lower(): value for key, value in document.items()}
     keys = {_MESSAGE_KEYS.get(key, key): value for key, value in lowered.items()}
     K = np.array(_numbers(path, keys, "camera_matrix", (9,))).reshape(3, 3)

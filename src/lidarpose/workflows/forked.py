@@ -37,8 +37,21 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _PATIENCE, _PATIENCE_S = 20.0, 10.0
 
 
+class NotAloneError(Exception):
+    """This process has a thread that Python does not know of, so that a copy of it may hang."""
+
+
 def copies_allowed() -> int:
     """How many copies of this process would have a core of their own; 0 where it must not, or cannot, be forked."""
+    copies = copies_likely()
+    return copies if copies > 0 and _is_alone() else 0
+
+
+def copies_likely() -> int:
+    """The same, but for threads that Python does not know of: `share` looks for them once it has forked.
+
+    To ask a fork beforehand takes as long as to make a copy.
+    """
     if sys.platform != "linux" or not hasattr(os, "memfd_create"):
         return 0
     if threading.active_count() > 1 or threading.current_thread() is not threading.main_thread():
@@ -50,7 +63,7 @@ def copies_allowed() -> int:
         os.close(os.memfd_create("probe"))
     except OSError:  # a container may forbid it
         return 0
-    return copies if _is_alone() else 0
+    return copies
 
 
 def _is_alone() -> bool:
@@ -58,6 +71,8 @@ def _is_alone() -> bool:
 
     Libraries that can be forked (OpenBLAS) end their threads for it; what is left then is another's. So it is tried.
     """
+    if _one_thread():
+        return True
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # it says what is asked here
         try:
@@ -67,14 +82,21 @@ def _is_alone() -> bool:
         if pid == 0:
             os._exit(0)
     try:
-        for _ in range(3):
-            if sum(1 for _ in Path("/proc/self/task").iterdir()) == 1:
-                return True
-            time.sleep(0.0005)  # a thread that has been joined may be seen for a moment more
-    except OSError:
-        pass
+        return _one_thread(tries=3)
     finally:
         _wait_for(pid)
+
+
+def _one_thread(tries: int = 1) -> bool:
+    """Whether the system knows of a single thread of this process."""
+    try:
+        for left in reversed(range(tries)):
+            if sum(1 for _ in Path("/proc/self/task").iterdir()) == 1:
+                return True
+            if left:
+                time.sleep(0.0005)  # a thread that has been joined, or ended for a fork, may be seen for a moment more
+    except OSError:
+        pass
     return False
 
 
@@ -93,7 +115,7 @@ def share(
     work
         Does piece k; what it changes besides its result may be lost. Results are pickled.
     copies
-        As `copies_allowed` says, or 0.
+        As `copies_allowed` or `copies_likely` says, or 0.
     first
         What this process does before it takes pieces, while the copies have begun.
     done
@@ -101,6 +123,7 @@ def share(
 
     Raises
     ------
+    NotAloneError, before anything is done here, where a copy was made beside a thread that Python does not know of.
     What `first` raises, else what `work` raises at the first piece, in their order, at which it does.
     """
     queue = os.memfd_create("queue") if copies > 0 and sys.platform == "linux" else -1
@@ -175,7 +198,7 @@ def _fork() -> int:
 
 
 def _start(started: list[_Copy], copies: int, queue: int, work: Callable[[int], object]) -> None:
-    """Fork; where that fails go on with fewer copies, or none."""
+    """Fork; where that fails go on with fewer copies, or none. Raises NotAloneError after the first, see `share`."""
     this = os.getpid()
     for _ in range(copies):
         results = os.memfd_create("results")
@@ -189,6 +212,9 @@ def _start(started: list[_Copy], copies: int, queue: int, work: Callable[[int], 
         if started[-1].pid == 0:
             _copy_lives(this, queue, results, work)
         os.close(alive)
+        # Libraries that can be forked have ended their threads for it.
+        if len(started) == 1 and not _one_thread(tries=3):
+            raise NotAloneError
 
 
 def _copy_lives(parent: int, queue: int, results: int, work: Callable[[int], object]) -> NoReturn:

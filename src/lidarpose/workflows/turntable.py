@@ -24,7 +24,7 @@ from lidarpose.model.sense import StatedSense
 from lidarpose.model.session import TurntablePlace, TurntableSession
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_run import Deviation, FunctionDeviation, Method, TruthError, TurntableRun
-from lidarpose.workflows.forked import copies_allowed, share
+from lidarpose.workflows.forked import NotAloneError, copies_likely, share
 from lidarpose.workflows.named_causes import with_cause_named
 from lidarpose.workflows.reversed_scans import Solved, doubt_reversed, reversed_part, reversed_scans
 from lidarpose.workflows.turning_sense import check_sense, compared, turning_sense
@@ -57,11 +57,8 @@ IMAGES_AT_ONCE = 12
 BATCHES_AHEAD = 4
 """So many batches of images are decoded while earlier ones are searched; more would only take memory."""
 
-LEAST_BATCHES = 3
-"""With fewer there is too little to share."""
-
-LEAST_AT_ONCE = 3
-"""The last batches are smaller, down to this, so that no process waits long for another one's last batch."""
+LEAST_SHARED = 5
+"""With fewer places there is too little to share."""
 
 MOST_CONTRADICTING = 0.15
 """Share of the places with both stripes that may contradict the others before the whole is in doubt."""
@@ -269,12 +266,13 @@ def detect_features(
     `meanwhile` is called once, with the boards, while others search or decode images.
     """
     batches = _batches(session.places)
-    copies = copies_allowed() if len(batches) >= LEAST_BATCHES else 0
-    if copies == 0:
-        found = _detect_alone(session, batches, step, meanwhile)
-    else:
-        with ExitStack() as stack:
+    copies = copies_likely() if len(session.places) >= LEAST_SHARED else 0
+    found: _Detected | None = None
+    if copies > 0:
+        with suppress(NotAloneError), ExitStack() as stack:
             found = _detect_with_copies(session, batches, copies, step, meanwhile, stack)
+    if found is None:
+        found = _detect_alone(session, batches, step, meanwhile)
     boards, all_lines, all_stripes = found
     places: list[PlaceFeatures] = []
     left_out: list[LeftOut] = []
@@ -332,12 +330,9 @@ def _detect_with_copies(
         stack.enter_context(one_opencv_thread())
         found.append(_detect_boards(session))
 
-    lines = share(
-        lambda k: [_find_scan_lines(session, place) for place in batches[k]],
-        len(batches),
-        copies=copies,
-        first=find_boards,
-    )
+    # One scan at a time: nobody waits long for another one's last.
+    places = list(chain(*batches))
+    lines = share(lambda k: _find_scan_lines(session, places[k]), len(places), copies=copies, first=find_boards)
     boards, finders = found[0]
 
     def search(k: int) -> list[_Stripes]:
@@ -352,7 +347,7 @@ def _detect_with_copies(
         first=lambda: meanwhile(boards),
         done=lambda k: _advance(step, batches[k]),
     )
-    return boards, list(chain(*lines)), list(chain(*stripes))
+    return boards, lines, list(chain(*stripes))
 
 
 def _advance(step: Step | None, batch: Batch) -> None:
@@ -413,12 +408,15 @@ def _find_scan_lines(session: TurntableSession, place: TurntablePlace) -> tuple[
 
 
 def _batches(places: Sequence[TurntablePlace]) -> list[Batch]:
-    """Places in their order, some at a time, fewer towards the end, all of a batch of one placement of the board."""
+    """Places in their order, some at a time, all of a batch of one placement of the board.
+
+    Fewer towards the end, and one at last, so that no process waits long for another one's last batch.
+    """
     batches: list[Batch] = []
     for _, group in groupby(places, key=lambda place: place.placement):
         own = list(group)
         while own:
-            count = min(max(-(-len(own) // 4), LEAST_AT_ONCE), IMAGES_AT_ONCE)
+            count = min(-(-len(own) // 4), IMAGES_AT_ONCE)
             batches.append(own[:count])
             own = own[count:]
     return batches
