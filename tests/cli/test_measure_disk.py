@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from lidarpose.cli.main import run
+from lidarpose.model.calibration import TurntableCalibration
+from lidarpose.storage.calibration import read_turntable_calibration, write_calibration
 
 
 def test_measures_what_was_simulated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -18,6 +20,12 @@ def test_measures_what_was_simulated(tmp_path: Path, capsys: pytest.CaptureFixtu
     disk = json.loads(capsys.readouterr().out)
     assert disk["diameter_mm"] == pytest.approx(truth["diameter_mm"], abs=0.15)
     assert 0.0 < disk["sigma_mm"] < 0.1
+    assert disk["sigma_parts_mm"]["calibration"] == 0.0
+    assert not any("covariance" in remark for remark in disk["remarks"])
+    bare = tmp_path / "bare.json"
+    write_calibration(bare, TurntableCalibration(read_turntable_calibration(tmp_path / "rec.calibration.json").motion))
+    assert run(["measure", "disk", str(folder), str(bare), "--json"]) == 0
+    disk = json.loads(capsys.readouterr().out)
     assert disk["sigma_parts_mm"]["calibration"] is None
     assert any("covariance" in remark for remark in disk["remarks"])
     np.testing.assert_allclose(disk["centre_m"], truth["centre_m"], atol=3e-4)

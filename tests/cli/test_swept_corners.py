@@ -1,7 +1,7 @@
 """Sweeps of a turned 2D LiDAR as frames of a corner session: recordings, scanned into clouds, give world <- camera."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +12,13 @@ from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose, exp_so3
 from lidarpose.model.calibration import TurntableCalibration, WorldCalibration
+from lidarpose.model.cloud import Cloud
+from lidarpose.model.corner_session import CloudSource, is_recording
+from lidarpose.model.recording import SweepRecording
 from lidarpose.model.turntable import TurntableMotion
-from lidarpose.storage.calibration import read_turntable_calibration, read_world_calibration
+from lidarpose.storage.calibration import read_turntable_calibration, read_world_calibration, write_calibration
 from lidarpose.storage.corner_session import read_corner_session
-from lidarpose.workflows.recorded_corners import with_scans
+from lidarpose.workflows.recorded_corners import ScannedCloud, with_scans
 from lidarpose.workflows.world import world_run
 
 # The carton stands on its tip, towards the camera; it is moved, never turned.
@@ -187,3 +190,85 @@ def test_the_turntables_own_covariance_reaches_the_world(recorded: Path) -> None
     assert known.quality is not None
     assert plain.quality is not None
     assert known.quality.figures["sigma_position_mm"] > 1.5 * plain.quality.figures["sigma_position_mm"]
+
+
+def test_a_turntable_of_unknown_uncertainty_is_named(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = read_turntable_calibration(recorded / "turntable.json")
+    write_calibration(tmp_path / "bare.json", TurntableCalibration(known.motion))
+    out = ["-o", str(tmp_path / "out"), "--turntable", str(tmp_path / "bare.json")]
+    assert run(["calibrate", str(recorded / "session"), *out]) == 0
+    assert "states no covariance" in " ".join(capsys.readouterr().out.split())
+    document = json.loads((tmp_path / "out/calibration.json").read_text())
+    assert document["quality"]["verdict"] == "doubtful"
+
+
+def test_shifts_of_a_turntable_that_never_stops() -> None:
+    """Against clouds that each parameter has bent, readings being interpolated within the sweeps."""
+    sweeps, beams = 25, 61
+    rng = np.random.default_rng(5)
+    recording = SweepRecording(
+        "turning",
+        np.linspace(-15.0, 15.0, sweeps),
+        np.linspace(-40.0, 40.0, beams),
+        rng.uniform(1.0, 3.0, (sweeps, beams)),
+        time_s=0.1 * np.arange(sweeps),
+    )
+    mounting = Pose(exp_so3(np.array([0.3, -0.2, 1.4])), np.array([0.08, 0.0, 0.0]))
+    motion = TurntableMotion(Pose.exp(np.array([0.1, -0.2, 0.05, -1.2, 0.4, 0.3])), mounting)
+
+    class Source:
+        name = "turning"
+
+        def recording(self) -> SweepRecording:
+            return recording
+
+    def points(motion: TurntableMotion, *, never_stops: bool = True) -> FloatArray:
+        cloud = ScannedCloud(Source(), TurntableCalibration(motion), never_stops).load().points
+        return np.asarray(cloud, dtype=np.float64)
+
+    still = points(motion, never_stops=False)
+    turning = points(motion)
+    assert still.shape == turning.shape
+    # 1.25 degrees a sweep.
+    assert np.linalg.norm(turning - still, axis=1).max() > 0.005
+    shifts = ScannedCloud(Source(), TurntableCalibration(motion), never_stops=True).shifts()(turning)
+    step = 1e-3
+    for k, change in enumerate(step * np.eye(10)):
+        moved = (points(bent(motion, change)) - points(bent(motion, -change))) / (2.0 * step)
+        np.testing.assert_allclose(shifts[:, :, k], moved, atol=2e-3)
+
+
+@dataclass(frozen=True)
+class Timed:
+    """A recording with a time for each sweep."""
+
+    source: CloudSource
+
+    @property
+    def name(self) -> str:
+        return self.source.name
+
+    def load(self) -> Cloud:
+        return self.source.load()
+
+    def recording(self) -> SweepRecording:
+        assert is_recording(self.source)
+        recording = self.source.recording()
+        return replace(recording, time_s=0.1 * np.arange(recording.sweeps))
+
+
+def test_a_turntable_that_never_stops_reaches_the_world(recorded: Path) -> None:
+    """What its covariance adds is nearly the same where readings are interpolated within the sweeps."""
+    session = read_corner_session(recorded / "session")
+    motion = read_turntable_calibration(recorded / "turntable.json").motion
+    known = TurntableCalibration(motion, np.diag(np.array([1e-3] * 6 + [5e-4] + [1e-3] * 3) ** 2))
+    places = [replace(p, clouds=tuple(map(Timed, p.clouds))) for p in session.places]
+    timed = replace(session, turntable=known, places=tuple(places))
+    stopped, turning = (world_run(with_scans(timed, never_stops=turns)).calibration for turns in (False, True))
+    assert stopped.covariance is not None
+    assert turning.covariance is not None
+    assert np.degrees(turning.T_world_source.distance(stopped.T_world_source)[1]) > 0.02
+    scale = np.sqrt(np.diag(stopped.covariance))
+    np.testing.assert_allclose((turning.covariance - stopped.covariance) / np.outer(scale, scale), 0.0, atol=0.15)

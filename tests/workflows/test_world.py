@@ -94,6 +94,48 @@ def test_mistakes_in_the_coordinates_are_named(simulated: Simulated, mistake: st
     assert named in reasons(calibrate_world(changed))
 
 
+def squared_error(calibration: WorldCalibration, truth: CornerTruth) -> float:
+    """Over the covariance: 6 in the mean if that is honest."""
+    assert calibration.covariance is not None
+    xi = calibration.T_world_source.minus(truth.T_world_lidar)
+    return float(xi @ np.linalg.solve(calibration.covariance, xi))
+
+
+@pytest.mark.parametrize("off_mm", [5.0, 20.0])
+def test_one_wrong_coordinate_is_named_and_in_the_covariance(simulated: Simulated, off_mm: float) -> None:
+    session, truth, _ = simulated
+    world = np.stack([p.corner_world for p in session.places])
+    world[1] += 1e-3 * off_mm * np.array([0.6, 0.0, 0.8])
+    result = calibrate_world(with_world(session, world))
+    # Any coordinate that is off by millimetres moves the pose by far more than the noise of the ranges.
+    assert result.T_world_source.distance(truth.T_world_lidar)[0] > 0.001
+    assert "the world coordinates of p01 are off by " in reasons(result)
+    assert squared_error(result, truth) < 12.6
+
+
+def test_no_coordinate_is_blamed_where_all_are_uncertain() -> None:
+    found = []
+    for seed in range(8):
+        spec = CornerSceneSpec(frames=1, places=3 + 2 * (seed % 2), seed=seed, world_sigma_m=0.003, hints=True)
+        session, truth = simulate_corner_session(spec)
+        result = calibrate_world(replace(session, world_sigma_m=None))
+        assert result.quality is not None
+        assert not any("if all others are right" in reason for reason in result.quality.reasons)
+        found.append(squared_error(result, truth))
+    # Without what a noise of three to nine degrees of freedom leaves open their mean is 20.
+    assert np.mean(found) < 10.0
+
+
+def test_coordinates_that_fit_better_mirrored_are_left_handed() -> None:
+    # Places nearly in one plane: without one of them the others fit unmirrored, to 5 mm.
+    pose = Pose(paper_rotation(86.40232, 23.70012, -8.81169), np.array([-0.483387, -0.865126, 1.5]))
+    spec = CornerSceneSpec(pose=pose, target="oblique", places=6, frames=1, seed=7001, ground_m=0.0, size_m=0.42400202)
+    spec = replace(spec, room=True, clutter=4)
+    session, _ = simulate_corner_session(spec)
+    world = np.stack([p.corner_world for p in session.places])
+    assert "left-handed" in reasons(calibrate_world(with_world(session, world * [1.0, -1.0, 1.0])))
+
+
 def test_a_target_turned_far_is_named() -> None:
     spec = CornerSceneSpec(frames=2, places=5, seed=3, turned_place=2, turned_deg=15.0)
     session, truth = simulate_corner_session(spec)

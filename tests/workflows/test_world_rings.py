@@ -83,3 +83,27 @@ def test_beams_that_cross_are_noticed_and_not_moved_unasked() -> None:
         metres, radians = stated.T_world_source.distance(truth.T_world_lidar)
         assert metres < 0.002
         assert radians < np.radians(0.05)
+
+
+def test_a_crossing_that_the_data_leave_open_is_in_the_covariance() -> None:
+    """The arrow's faces hardly tell it: a VLP-16's clouds with and without it, and another LiDAR's."""
+    spec = CornerSceneSpec(pose="arrow", lidar="vlp16", frames=1, hints=True, seed=13)
+    for crossing_m in (0.0, CROSSING_M):
+        session, truth = simulate_corner_session(replace(spec, beam_crossing_m=crossing_m))
+        result = world_run(session).calibration
+        assert result.quality is not None
+        assert result.quality.verdict == "doubtful"
+        assert any("beam_crossing_m = 0.0419" in reason for reason in result.quality.reasons)
+        assert result.covariance is not None
+        xi = result.T_world_source.minus(truth.T_world_lidar)
+        assert xi @ np.linalg.solve(result.covariance, xi) < 20.0
+        # Stated, as absent here, it is nothing more to doubt or to add.
+        stated = world_run(replace(session, lidar=replace(session.lidar, beam_crossing_m=0.0))).calibration
+        assert stated.quality is not None
+        assert stated.covariance is not None
+        assert not any("VLP-16's" in reason for reason in stated.quality.reasons)
+        assert np.linalg.eigvalsh(result.covariance - stated.covariance)[-1] > 0.0
+        np.testing.assert_array_equal(stated.T_world_source.matrix, result.T_world_source.matrix)
+    other = world_run(simulate_corner_session(replace(spec, lidar="hdl32"))[0]).calibration
+    assert other.quality is not None
+    assert other.quality.verdict == "good"

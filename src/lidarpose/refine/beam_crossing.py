@@ -21,6 +21,9 @@ from lidarpose.refine.ring_offsets import Rings, ring_equations
 # So many standard deviations are no chance; what edges and mixed pixels do to faces passes for some millimetres.
 SEEN_SIGMAS = 3.5
 LEAST_M = 0.01
+# A VLP-16's, by its manual, and how well its elevations are nominal in the clouds that its drivers make.
+MAKERS_CROSSING_M = 0.0419
+_SAME_DEG = 0.03
 # Of rings that are not off: what single precision leaves.
 _LEAST_RING_SIGMA_M = 1e-5
 
@@ -33,21 +36,72 @@ class SeenCrossing:
     ----------
     crossing_m, sigma_m
         The distance, and its standard deviation.
-    move : (n,)
-        What the joint estimate's parameters would change by.
+    by_metre : (n,)
+        What the joint estimate's parameters change by, for each metre of it.
     freedom
         Degrees of freedom that the standard deviation rests on, where the world's noise was estimated with it.
     """
 
     crossing_m: float
     sigma_m: float
-    move: FloatArray
+    by_metre: FloatArray
     freedom: float = np.inf
+
+    @property
+    def move(self) -> FloatArray:
+        """What the joint estimate's parameters (n,) would change by."""
+        return np.asarray(self.crossing_m * self.by_metre)
 
     @property
     def told(self) -> bool:
         """Whether the data speak for it."""
         return abs(self.crossing_m) > max(_student(self.freedom) * self.sigma_m, LEAST_M)
+
+    @property
+    def makers_chance(self) -> float:
+        """How likely the distance is `MAKERS_CROSSING_M` and not zero, if either is, and beforehand as likely."""
+
+        def twice_log_likelihood(far_m: float) -> float:
+            square = ((self.crossing_m - far_m) / self.sigma_m) ** 2
+            return -square if np.isinf(self.freedom) else -(self.freedom + 1.0) * np.log1p(square / self.freedom)
+
+        gain = twice_log_likelihood(MAKERS_CROSSING_M) - twice_log_likelihood(0.0)
+        return float(1.0 / (1.0 + np.exp(np.clip(-0.5 * gain, -700.0, 700.0))))
+
+
+@dataclass(frozen=True, eq=False)
+class OpenCrossing:
+    """A crossing that the LiDAR's maker states, and of which the data do not tell whether the clouds hold it.
+
+    Attributes
+    ----------
+    chance
+        That they do not.
+    move : (n,)
+        What the joint estimate's parameters are then off by.
+    """
+
+    chance: float
+    move: FloatArray
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Mean square (n, n) of that."""
+        return np.asarray(self.chance * np.outer(self.move, self.move))
+
+
+def open_crossing(seen: SeenCrossing, rings: Rings) -> OpenCrossing | None:
+    """What a VLP-16's crossing may do to the estimate; None for another LiDAR, where nothing is known of any."""
+    if seen.told or not _are_a_vlp16s(rings):
+        return None
+    return OpenCrossing(seen.makers_chance, np.asarray(MAKERS_CROSSING_M * seen.by_metre))
+
+
+def _are_a_vlp16s(rings: Rings) -> bool:
+    """Whether all beams rise by odd degrees, as seen from the origin: where clouds hold the crossing, they do not."""
+    elevation_deg = np.degrees(rings.elevation_rad)
+    odd = 2.0 * np.round((elevation_deg - 1.0) / 2.0) + 1.0
+    return bool(np.all(np.abs(elevation_deg - odd) < _SAME_DEG) and np.all(np.abs(elevation_deg) < 16.0))
 
 
 def _student(freedom: float) -> float:
@@ -117,4 +171,4 @@ def seen_crossing(
     if not left > 1e-9 * own:
         return None
     crossing = (pull - float(along @ np.concatenate([equations.pull, equations.ring_pull]))) / left
-    return SeenCrossing(crossing, float(np.sqrt(common_error / left)), -crossing * along[:n])
+    return SeenCrossing(crossing, float(np.sqrt(common_error / left)), -along[:n])

@@ -595,6 +595,22 @@ def own_turns(fit: CornerFit) -> dict[int, tuple[float, float]]:
     return found
 
 
+def without_world_noise(fit: CornerFit) -> tuple[FloatArray, FloatArray, int]:
+    """Normal equations at the joint estimate with the world's coordinates as they are given, their errors free.
+
+    Returns
+    -------
+    Information (n, n) and gradient (n,) without what the world's noise says of its errors, and where those begin.
+    """
+    options = CornerOptions(1.0, "log_scale" in fit.names)
+    state = replace(fit.state, world_errors=np.zeros_like(fit.world))
+    information, gradient = _joined(fit.systems, state, fit.world, options)
+    errors = _columns(len(fit.world), options)[1]
+    information[errors:, errors:] -= np.eye(len(gradient) - errors)
+    # The faces' own systems stand where the estimate's errors put their corners.
+    return information, gradient + information[:, errors:] @ fit.state.world_errors.ravel(), errors
+
+
 def estimate_world_sigma(fit: CornerFit) -> tuple[float, float]:
     """How well the world coordinates seem to be measured: restricted maximum likelihood on the collapsed systems.
 

@@ -15,9 +15,10 @@ from lidarpose.model.calibration import Quality, Verdict
 from lidarpose.model.corner_result import CornerPlaceFaces
 from lidarpose.model.corner_session import CloudFrame
 from lidarpose.model.observation import LeftOut
-from lidarpose.refine.beam_crossing import SeenCrossing
+from lidarpose.refine.beam_crossing import MAKERS_CROSSING_M, OpenCrossing, SeenCrossing
 from lidarpose.refine.corner_model import CornerFit, place_discrepancies
 from lidarpose.refine.spot_scatter import SpotScatter, common_error_factor
+from lidarpose.refine.wrong_coordinate import WrongCoordinate
 
 # A turn of the target: far beyond chance (three degrees of freedom, six where a place stands by itself) and large
 # enough to matter.
@@ -28,6 +29,8 @@ WORLD_SIGMA_DOUBTFUL_MM = 10.0
 NOISE_RATIO_DOUBTFUL = 3.0
 # Where distances disagree by less, nobody asks why.
 LEAST_MISFIT_M = 0.002
+# A crossing that the data leave open is named where it is at least so likely, and moves the pose so far beyond chance.
+OPEN_CHANCE, OPEN_SIGMAS = 0.05, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +39,9 @@ class CornerEvidence:
 
     `rings_told` are the degrees of freedom that offsets of rings have taken from the residuals; `crossing` is where a
     multi-beam LiDAR's beams seem to cross, None where that was not asked. `further_covariance` (n, n) is of
-    what the residuals cannot tell; `scatter` is that of the spots, where it is known.
+    what the residuals cannot tell; `scatter` is that of the spots, where it is known. `wrong` is the place whose world
+    coordinates alone may be wrong, `possible` a crossing of the beams that the data leave open; both are in that
+    covariance. `turntable_unknown`: clouds have the errors of a turntable whose calibration states none.
     """
 
     positions: tuple[str, ...]
@@ -52,6 +57,9 @@ class CornerEvidence:
     crossing: SeenCrossing | None = None
     further_covariance: FloatArray | None = None
     scatter: Mapping[tuple[int, int], SpotScatter] | None = None
+    wrong: WrongCoordinate | None = None
+    possible: OpenCrossing | None = None
+    turntable_unknown: bool = False
 
 
 @dataclass(frozen=True)
@@ -114,6 +122,13 @@ def judge_corner_fit(
             "sigma": 1e3 * evidence.crossing.sigma_m,
         }
         _judge_crossing(verdict, evidence.crossing)
+    if evidence.possible is not None:
+        _judge_open_crossing(verdict, evidence.possible, factor * fit.pose_covariance)
+    if evidence.turntable_unknown:
+        verdict.doubt(
+            "the turntable's calibration states no covariance, so that its errors are not in the standard deviations: "
+            "calibrate the turntable with the joint method, whose file holds one"
+        )
     return Quality(verdict.verdict, tuple(verdict.reasons), figures)
 
 
@@ -131,6 +146,18 @@ def _judge_crossing(verdict: _Verdict, seen: SeenCrossing) -> None:
         verdict.doubt(
             f"the LiDAR's beams seem to cross {far:.0f} mm (standard deviation {sigma:.0f}) nearer to its axis, or "
             "farther behind it, than the clouds hold: correct beam_crossing_m under [lidar], or leave it out"
+        )
+
+
+def _judge_open_crossing(verdict: _Verdict, possible: OpenCrossing, covariance: FloatArray) -> None:
+    move = possible.move[:6]
+    far = float(np.sqrt(move @ np.linalg.solve(covariance, move)))
+    if possible.chance > OPEN_CHANCE and far > OPEN_SIGMAS:
+        verdict.doubt(
+            f"the beams are a VLP-16's, which cross {1e3 * MAKERS_CROSSING_M:.0f} mm before its axis; the data leave "
+            "open whether the clouds hold that, and the pose depends on it: state "
+            f"beam_crossing_m = {MAKERS_CROSSING_M:g} under [lidar] if its driver lets all beams start at one point, "
+            "0 if the clouds are right"
         )
 
 
@@ -314,6 +341,12 @@ def _judge_world(
     errors_mm = 1e3 * np.linalg.norm(fit.state.world_errors, axis=1)
     if fit.world_sigma_m <= 0.0:
         return
+    wrong = evidence.wrong
+    if wrong is not None and wrong.told and evidence.stated_world_sigma_m is None:
+        verdict.doubt(
+            f"the world coordinates of {places[wrong.place].position} are off by {1e3 * wrong.off_m:.1f} mm if all "
+            "others are right, which explains what disagrees better than errors of all: measure them again"
+        )
     worst = int(np.argmax(errors_mm))
     name = places[worst].position
     if evidence.stated_world_sigma_m:

@@ -15,7 +15,7 @@ from lidarpose.errors import InputError
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.recording import RealArray, SweepRecording
 from lidarpose.model.scan import LidarSpec
-from lidarpose.model.turntable import TurntableMotion
+from lidarpose.model.turntable import PARAMETER_NAMES, TurntableMotion
 from lidarpose.storage.atomic import replacing_folder, restore_folder, write_text
 from lidarpose.storage.calibration import transform_entry, write_calibration
 from lidarpose.storage.documents import Schema, check_format, parse, read_toml
@@ -117,7 +117,9 @@ def write_simulated_recording(
     truth_path(out).unlink(missing_ok=True)
     calibration.unlink(missing_ok=True)
     write_recording(out, recording)
-    write_calibration(calibration, TurntableCalibration(motion))
+    # The truth is known exactly, which is not the same as nobody knows how well.
+    exact = np.zeros((len(PARAMETER_NAMES), len(PARAMETER_NAMES)))
+    write_calibration(calibration, TurntableCalibration(motion, exact))
     transforms = [
         transform_entry("camera", "turntable", motion.T_camera_turntable),
         transform_entry("turntable", "lidar", motion.T_turntable_lidar),

@@ -285,6 +285,10 @@ def _is_ambiguous(matches: Sequence[CornerMatch], world: FloatArray) -> bool:
     return False
 
 
+_MIRROR = np.array([1.0, -1.0, 1.0])
+_MIRRORED = "the world coordinates are left-handed (mirrored): one axis points the wrong way"
+
+
 def _match_with_mistakes(
     candidates: Sequence[Sequence[CornerCandidate]], world: FloatArray, free_scale: bool
 ) -> tuple[tuple[CornerMatch, ...], FloatArray, str]:
@@ -292,6 +296,9 @@ def _match_with_mistakes(
     plain = match_corners(candidates, world)
     count = len(world)
     if plain and plain[0].places >= max(3, count - 1):
+        mirrored = match_corners(candidates, world * _MIRROR) if plain[0].places < count else ()
+        if mirrored and mirrored[0].places == count and mirrored[0].rms_m < plain[0].rms_m:
+            return mirrored, world * _MIRROR, _MIRRORED
         return plain, world, ""
     best = (plain, world, "")
     best_places = plain[0].places if plain else 0
@@ -312,7 +319,7 @@ def _mistakes(world: FloatArray, free_scale: bool) -> Iterator[tuple[FloatArray,
     if free_scale:
         for factor in np.geomspace(0.8, 1.25, 19):
             yield factor * world, ""
-    yield world * [1.0, -1.0, 1.0], "the world coordinates are left-handed (mirrored): one axis points the wrong way"
+    yield world * _MIRROR, _MIRRORED
     if len(world) <= 12:
         for a, b in combinations(range(len(world)), 2):
             swapped = world.copy()

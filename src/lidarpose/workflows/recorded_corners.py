@@ -91,3 +91,8 @@ def with_scans(session: CornerSession, *, never_stops: bool = False) -> CornerSe
 
     places = tuple(replace(place, clouds=tuple(map(scanned, place.clouds))) for place in session.places)
     return replace(session, places=places)
+
+
+def holds_scans(session: CornerSession) -> bool:
+    """Whether clouds are assembled by a turntable's calibration, so that they have its errors."""
+    return any(isinstance(cloud, ScannedCloud) for place in session.places for cloud in place.clouds)

@@ -19,7 +19,7 @@ from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, Fac
 from lidarpose.model.corner_session import CornerSession
 from lidarpose.model.observation import LeftOut
 from lidarpose.model.world_run import WorldRun
-from lidarpose.refine.beam_crossing import SeenCrossing, seen_crossing, without_crossing
+from lidarpose.refine.beam_crossing import OpenCrossing, SeenCrossing, open_crossing, seen_crossing, without_crossing
 from lidarpose.refine.corner_model import (
     SETTLED,
     CornerFit,
@@ -41,6 +41,7 @@ from lidarpose.refine.corner_verdict import (
 from lidarpose.refine.face_rims import without_rims
 from lidarpose.refine.ring_offsets import RingOffsets, Rings, find_rings, ring_offsets, some_returns
 from lidarpose.refine.spot_scatter import common_error_factor, spot_scatter, weighed_by_angle
+from lidarpose.refine.wrong_coordinate import unsure_noise, wrong_coordinate
 from lidarpose.solve.corner_alignment import cayley_pose, pair_scale, svd_pose
 from lidarpose.solve.corner_matching import face_order
 from lidarpose.workflows.corner_target import (
@@ -53,7 +54,7 @@ from lidarpose.workflows.corner_target import (
     observe,
     observe_inner,
 )
-from lidarpose.workflows.recorded_corners import with_scans
+from lidarpose.workflows.recorded_corners import holds_scans, with_scans
 from lidarpose.workflows.thin_face import with_thin_face
 from lidarpose.workflows.turntable_share import turntable_share
 from lidarpose.workflows.world_evidence import corners_run, joint_run
@@ -272,7 +273,7 @@ def _joint(
     corners = _expected(fit, places, found.world)
     places = without_rims(places, fit.state.normals, corners, fit.range_sigma_m, common_error)
     fit, used = _fit(mended, places, fit.state, fit.range_sigma_m, scale_too)
-    fit, used, offsets, crossing = _without_ring_offsets(mended, fit, used)
+    fit, used, offsets, crossing, possible = _without_ring_offsets(mended, fit, used)
     scatter = spot_scatter(fit, used)
     if offsets is None and (crossing is None or not crossing.told):
         fit = weighed_by_angle(fit, used, scatter)
@@ -281,6 +282,11 @@ def _joint(
         for name, n in dropped.items()
     ]
     share = turntable_share(session, fit, used)
+    wrong = wrong_coordinate(fit)
+    further = [part.covariance for part in (share, wrong, possible) if part is not None]
+    if session.world_sigma_m is None and fit.world_sigma_m > 0.0:
+        further.append(unsure_noise(fit))
+    further_covariance = np.asarray(sum(further)) if further else None
     evidence = CornerEvidence(
         tuple(p.position for p in used),
         tuple(left_out),
@@ -293,13 +299,16 @@ def _joint(
         0.0 if offsets is None else offsets.told,
         {} if offsets is None else offsets.figures,
         crossing,
-        None if share is None else share.covariance,
+        further_covariance,
         scatter,
+        wrong,
+        possible,
+        share is None and holds_scans(session),
     )
     quality = judge_corner_fit(fit, used, evidence, limits)
     covariance = fit.covariance * float(quality.figures["covariance_factor"])
-    if share is not None:
-        covariance = covariance + share.covariance
+    if further_covariance is not None:
+        covariance = covariance + further_covariance
     calibration = WorldCalibration(
         fit.state.T_world_lidar,
         session.cloud_frame,
@@ -470,20 +479,22 @@ def _fit(
 
 def _without_ring_offsets(
     session: CornerSession, fit: CornerFit, used: list[CornerPlaceFaces]
-) -> tuple[CornerFit, list[CornerPlaceFaces], RingOffsets | None, SeenCrossing | None]:
+) -> tuple[CornerFit, list[CornerPlaceFaces], RingOffsets | None, SeenCrossing | None, OpenCrossing | None]:
     """The joint estimate beside offsets of a multi-beam LiDAR's rings, where the data speak for any, and where its
-    beams seem to cross."""
+    beams seem to cross, or may cross."""
     few = some_returns(used) if session.cloud_frame == "lidar" else []
     few_rings = find_rings(few)
     if few_rings is None:
-        return fit, used, None, None
+        return fit, used, None, None, None
     estimate, clean, offsets = fit, used, None
     if ring_offsets(fit, few, few_rings) is not None:
         estimate, clean, offsets = _with_rings(session, fit, used)
     crossing = _crossing(session, estimate, clean, few, few_rings, offsets)
     if crossing is not None and crossing.told:
         estimate = replace(estimate, covariance=estimate.covariance + np.outer(crossing.move, crossing.move))
-    return estimate, clean, offsets, crossing
+    stated = session.lidar.beam_crossing_m is not None
+    possible = None if crossing is None or stated else open_crossing(crossing, few_rings)
+    return estimate, clean, offsets, crossing, possible
 
 
 def _crossing(
@@ -510,9 +521,8 @@ def _crossing(
         if again is None:
             return first
         total, last = total + again.crossing_m, again
-    move = first.move * (total / first.crossing_m)
     estimated = 8.0 if "log_scale" in fit.names else 7.0
-    return SeenCrossing(total, last.sigma_m, move, 3.0 * len(clean) - estimated)
+    return SeenCrossing(total, last.sigma_m, first.by_metre, 3.0 * len(clean) - estimated)
 
 
 def _with_rings(
