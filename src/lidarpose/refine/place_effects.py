@@ -47,6 +47,10 @@ class PlaceEffects:
     certainty_factor: float = 1.0
 
 
+_Standardised = tuple[FloatArray, FloatArray, FloatArray]
+"""Inverse covariances (S, 2, 2), squared standardised effects (S,), degrees of freedom (S,), all at one variance."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Effects:
     """Each line's own least-squares shift and slope: values (S, 2), their covariance (S, 2, 2) from the rows' scatter,
@@ -56,8 +60,7 @@ class _Effects:
     covariance: FloatArray
     absorbed: FloatArray
 
-    def standardised(self, variance: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Inverse covariances (S, 2, 2), squared standardised effects (S,), degrees of freedom (S,) at a variance."""
+    def standardised(self, variance: float) -> _Standardised:
         inverse = np.linalg.inv(self.covariance + variance * np.eye(2))
         square = np.einsum("si,sij,sj->s", self.own, inverse, self.own)
         freedom = np.maximum(2.0 - np.einsum("sij,sji->s", inverse, self.absorbed), 0.0)
@@ -83,22 +86,23 @@ def place_effects(moments: FloatArray, spread: FloatArray, before: float = 0.0) 
     effects, good = _effects(moments, spread)
     if good.sum() < 3:
         return PlaceEffects(0.0, np.ones(len(moments)))
-    variance = _robust_start(effects, good)
-    weight = _line_weights(effects, good, variance)
+    without = effects.standardised(0.0)
+    variance = _robust_start(effects, good, without)
+    at = effects.standardised(variance)
+    weight = _line_weights(at, good)
     for _ in range(30):
-        new = max(variance + _scoring_step(effects, weight * good, variance), 0.0)
+        new = max(variance + _scoring_step(effects, weight * good, at), 0.0)
         settled = abs(new - variance) <= 1e-4 * max(variance, 1e-300)
-        variance = new
-        weight = _line_weights(effects, good, variance)
+        variance, at = new, effects.standardised(new)
+        weight = _line_weights(at, good)
         if settled or variance == 0.0:
             break
     level = _SIGNIFICANCE if before == 0.0 else _HYSTERESIS
-    if not _significant(effects, good & (weight > 0.5), level):
-        variance = 0.0
-        weight = _line_weights(effects, good, variance)
+    if not _significant(without, good & (weight > 0.5), level):
+        return PlaceEffects(0.0, _line_weights(without, good))
     if variance == 0.0:
         return PlaceEffects(0.0, weight)
-    freedom = float((weight * good) @ effects.standardised(variance)[2])
+    freedom = float((weight * good) @ at[2])
     return PlaceEffects(variance, weight, freedom / (freedom - 2.0) if freedom > 3.0 else 3.0)
 
 
@@ -113,17 +117,17 @@ def _effects(moments: FloatArray, spread: FloatArray) -> tuple[_Effects, BoolArr
     return _Effects(coupling[:, :, -1], covariance, absorbed), good
 
 
-def _robust_start(effects: _Effects, good: BoolArray) -> float:
+def _robust_start(effects: _Effects, good: BoolArray, without: _Standardised) -> float:
     """From the median of the squared standardised effects, which pure noise puts at that of chi-square of 2."""
-    _, square, _ = effects.standardised(0.0)
+    _, square, _ = without
     ratio = float(np.median(square[good])) / _MEDIAN_CHI_SQUARE_2
     size = float(np.median(np.trace(effects.covariance[good], axis1=1, axis2=2))) / 2.0
     return max(ratio - 1.0, 0.0) * size
 
 
-def _line_weights(effects: _Effects, good: BoolArray, variance: float) -> FloatArray:
+def _line_weights(at: _Standardised, good: BoolArray) -> FloatArray:
     """Weights (S,), below 1 for lines that contradict all others; at most a quarter can be the odd ones out."""
-    _, square, _ = effects.standardised(variance)
+    _, square, _ = at
     root = (np.sqrt(square) - np.sqrt(LINE_CORE)) / (np.sqrt(LINE_REJECT) - np.sqrt(LINE_CORE))
     weight = np.where(good, 0.5 * (1.0 + np.cos(np.pi * np.clip(root, 0.0, 1.0))), 1.0)
     if (weight < 0.5).sum() > max(int(_MOST_LEFT_OUT * good.sum()), 1):
@@ -131,8 +135,8 @@ def _line_weights(effects: _Effects, good: BoolArray, variance: float) -> FloatA
     return np.asarray(weight)
 
 
-def _scoring_step(effects: _Effects, weight: FloatArray, variance: float) -> float:
-    inverse, _, freedom = effects.standardised(variance)
+def _scoring_step(effects: _Effects, weight: FloatArray, at: _Standardised) -> float:
+    inverse, _, freedom = at
     standard = (inverse @ effects.own[:, :, None])[:, :, 0]
     found = float(weight @ (standard**2).sum(axis=1))
     expected = float(weight @ (np.trace(inverse, axis1=1, axis2=2) * freedom / 2.0))
@@ -140,6 +144,6 @@ def _scoring_step(effects: _Effects, weight: FloatArray, variance: float) -> flo
     return (found - expected) / max(fisher, 1e-300)
 
 
-def _significant(effects: _Effects, use: BoolArray, level: float) -> bool:
-    _, square, freedom = effects.standardised(0.0)
+def _significant(without: _Standardised, use: BoolArray, level: float) -> bool:
+    _, square, freedom = without
     return bool(chi2_tail(float(square[use].sum()), max(float(freedom[use].sum()), 1.0)) < level)
