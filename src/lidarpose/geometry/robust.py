@@ -23,8 +23,7 @@ def mad_sigma(values: ArrayLike, *, centred: bool = False) -> float:
     x = np.asarray(values, dtype=np.float64)
     if x.size == 0:
         return float("nan")
-    centre = 0.0 if centred else median(x)
-    return MAD_TO_SIGMA * median(np.abs(x - centre))
+    return MAD_TO_SIGMA * median(np.abs(x if centred else x - median(x)))
 
 
 def median(values: FloatArray) -> float:

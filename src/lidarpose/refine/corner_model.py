@@ -144,6 +144,14 @@ def _tangents(x: float, y: float, z: float) -> FloatArray:
     return pair
 
 
+@lru_cache(maxsize=64)
+def _axes(x: float, y: float, z: float) -> FloatArray:
+    """A normal and its tangents as rows (3, 3)."""
+    axes = np.vstack([(x, y, z), _tangents(x, y, z).T])
+    axes.setflags(write=False)
+    return axes
+
+
 def face_residuals(returns: FaceReturns, normal: FloatArray, corner: FloatArray) -> FloatArray:
     """Measured minus expected ranges (N,), metres."""
     return np.asarray(returns.range_m - (normal @ corner) / (normal @ returns.rays))
@@ -171,15 +179,14 @@ def direction_cells(rays: FloatArray, cell_rad: float) -> IntArray:
 
 def face_rows(rays: FloatArray, normal: FloatArray, corner: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Expected ranges (N,), and their derivatives (3, N) by the plane's shift and two tilts about the corner."""
-    axes = np.vstack([normal, tangents(normal).T])
+    axes = _axes(*normal.tolist())
     rows = axes @ rays
     along = axes @ corner
-    shift = 1.0 / rows[0]
+    shift, tilts = np.divide(1.0, rows[0], out=rows[0]), rows[1:]
     expected = along[0] * shift
-    rows[1:] *= expected
-    np.subtract(along[1:, None], rows[1:], out=rows[1:])
-    rows[1:] *= shift
-    rows[0] = shift
+    tilts *= expected
+    np.subtract(along[1:, None], tilts, out=tilts)
+    tilts *= shift
     return expected, rows
 
 
@@ -191,12 +198,6 @@ def _weights(residual: FloatArray, sigma_m: float) -> FloatArray:
     np.maximum(z2, 0.0, out=z2)
     z2 *= z2
     return z2
-
-
-def _loss_terms(residual: FloatArray, sigma_m: float) -> tuple[FloatArray, FloatArray]:
-    """Tukey's weight psi(r)/r and the derivative of psi, of residuals (N,)."""
-    z2 = np.minimum((residual / (TUKEY_K * sigma_m)) ** 2, 1.0)
-    return (1.0 - z2) ** 2, (1.0 - z2) * (1.0 - 5.0 * z2)
 
 
 def _system(face: _Face, normal: FloatArray, corner: FloatArray, sigma_m: float) -> FaceSystem:
@@ -370,11 +371,19 @@ def fit_corner_model(
 
 def _loss_factor(residual: FloatArray, sigma_m: float) -> float:
     """What the loss costs: the M-estimate's variance over that of the information with weights."""
-    weight, slope = _loss_terms(residual, sigma_m)
-    psi = weight * residual / sigma_m
-    used = weight > 0.0
-    mean_slope = float(slope[used].mean())
-    return float((psi[used] ** 2).mean() / mean_slope**2 * weight[used].mean())
+    # Of z, the residual over where weights end, and v = 1 - z^2: the weight is v^2, psi^2 is K^2 z^2 v^4, its slope
+    # v (1 - 5 z^2) = 5 v^2 - 4 v. All are 0 where v is.
+    v = residual * (1.0 / (TUKEY_K * sigma_m))
+    v *= v
+    np.subtract(1.0, v, out=v)
+    np.maximum(v, 0.0, out=v)
+    v2 = v * v
+    first, second, fourth = float(v.sum()), float(v2.sum()), float(v2 @ v2)
+    v2 *= v
+    fifth = float(v2 @ (v * v))
+    used = np.count_nonzero(v)
+    psi2 = TUKEY_K**2 * (fourth - fifth)
+    return psi2 * second / (5.0 * second - 4.0 * first) ** 2 if used else float("nan")
 
 
 def parameter_names(positions: Sequence[str], options: CornerOptions) -> tuple[str, ...]:
