@@ -16,7 +16,7 @@ from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.rings import tangent_of_elevation
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.refine.corner_model import CornerFit, face_jacobians, weighted_rows
-from lidarpose.refine.ring_offsets import Rings, ring_equations
+from lidarpose.refine.ring_offsets import RingEquations, Rings, ring_equations
 
 # So many standard deviations are no chance; what edges and mixed pixels do to faces passes for some millimetres.
 SEEN_SIGMAS = 3.5
@@ -134,7 +134,12 @@ def _by_crossing(returns: FaceReturns, normal: FloatArray) -> FloatArray:
 
 
 def seen_crossing(
-    fit: CornerFit, places: Sequence[CornerPlaceFaces], rings: Rings, ring_sigma_m: float, common_error: float
+    fit: CornerFit,
+    places: Sequence[CornerPlaceFaces],
+    rings: Rings,
+    ring_sigma_m: float,
+    common_error: float,
+    equations: RingEquations | None = None,
 ) -> SeenCrossing | None:
     """One linear step for the crossing.
 
@@ -146,12 +151,14 @@ def seen_crossing(
         Standard deviation of the rings' offsets, 0 where they have none.
     common_error
         By how much spots' means scatter more than the noise allows, in squares.
+    equations
+        `ring_equations` of the first three, where they are known.
 
     Returns
     -------
     The crossing; None where the faces do not tell it.
     """
-    equations = ring_equations(fit, places, rings)
+    equations = equations or ring_equations(fit, places, rings)
     count, n = len(rings.elevation_rad), len(equations.pull)
     corners = fit.state.corners(fit.world)
     jacobians = face_jacobians(list(rings.numbers), fit.state, fit.world, fit.options)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -108,6 +108,11 @@ class CornerFit:
     def options(self) -> CornerOptions:
         """What was estimated."""
         return CornerOptions(self.world_sigma_m, "log_scale" in self.names)
+
+    @cached_property
+    def discrepancies(self) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """See `place_discrepancies`."""
+        return place_discrepancies(self)
 
     @property
     def pose_covariance(self) -> FloatArray:

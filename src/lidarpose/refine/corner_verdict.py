@@ -16,7 +16,7 @@ from lidarpose.model.corner_result import CornerPlaceFaces
 from lidarpose.model.corner_session import CloudFrame
 from lidarpose.model.observation import LeftOut
 from lidarpose.refine.beam_crossing import MAKERS_CROSSING_M, OpenCrossing, SeenCrossing
-from lidarpose.refine.corner_model import CornerFit, place_discrepancies
+from lidarpose.refine.corner_model import CornerFit
 from lidarpose.refine.spot_scatter import SpotScatter, common_error_factor
 from lidarpose.refine.wrong_coordinate import WrongCoordinate
 
@@ -93,7 +93,7 @@ def judge_corner_fit(
     """Verdict on the joint estimate, with reasons and figures."""
     verdict = _Verdict()
     factor = common_error_factor(fit, places, evidence.rings_told, evidence.scatter)
-    moves, statistic, known = place_discrepancies(fit)
+    moves, statistic, known = fit.discrepancies
     # Each place's corner by its own returns, at the common orientation: what the world coordinates are held against.
     corners = fit.state.scale * (fit.state.corners(fit.world) + np.where(known[:, None], moves[:, :3], 0.0))
     covariance = fit.covariance * factor

@@ -162,10 +162,14 @@ def _common_part(face: _Face) -> tuple[FloatArray, FloatArray]:
     out = along @ points.astype(np.float32)
     begins = np.flatnonzero(np.diff(place, prepend=-1))
     most, least = (np.median(ends.reduceat(out, begins, axis=1), axis=1) for ends in (np.maximum, np.minimum))
-    far = np.any((out > most[:, None] + 1e-6) | (out < least[:, None] - 1e-6), axis=0)
-    if 0 < np.count_nonzero(far) < far.size - FEWEST_RETURNS:
-        points = points.compress(~far, axis=1)
-        out = along @ points.astype(np.float32)
+    beyond = out > most[:, None] + 1e-6
+    beyond |= out < least[:, None] - 1e-6
+    near = np.flatnonzero(~beyond.any(axis=0))
+    if FEWEST_RETURNS < near.size < place.size:
+        points = points.take(near, axis=1)
+        # Into the same memory: as much again would have to be had from the system first.
+        again = out.ravel()[: len(along) * near.size].reshape(len(along), near.size)
+        out = np.matmul(along, points.astype(np.float32), out=again)
     outermost = np.concatenate([out.argmax(axis=1), out.argmin(axis=1)])
     return points, np.asarray(points[:, outermost[outermost != np.roll(outermost, 1)]].T)
 

@@ -158,6 +158,7 @@ def ring_offsets(
     rings: Rings,
     before: FloatArray | None = None,
     common_error: float = 1.0,
+    equations: RingEquations | None = None,
 ) -> RingOffsets | None:
     """Estimate the offsets of all rings beside a joint estimate.
 
@@ -171,12 +172,14 @@ def ring_offsets(
         Offsets that the places' ranges are already free of.
     common_error
         By how much spots' means scatter more than the noise allows, in squares, offsets apart.
+    equations
+        `ring_equations` of all these, where they are known.
 
     Returns
     -------
     The offsets; None where nothing speaks for any.
     """
-    equations = ring_equations(fit, places, rings)
+    equations = equations or ring_equations(fit, places, rings)
     information, gradient = equations.reduced()
     if before is not None:
         gradient = gradient + information @ before

@@ -462,8 +462,9 @@ def observe_inner(
 def _reaches_both_ways(faces: Mapping[int, FaceReturns]) -> bool:
     """Whether each face's returns are spread over two directions, not along one scan line."""
     for returns in faces.values():
-        spread = np.linalg.svd(returns.directions - returns.directions.mean(axis=0), compute_uv=False)
-        if spread[1] < 0.1 * spread[0]:
+        off = returns.rays - returns.rays.mean(axis=1, keepdims=True)
+        squares = np.linalg.eigvalsh(off @ off.T)
+        if squares[1] < 0.1**2 * squares[2]:
             return False
     return True
 

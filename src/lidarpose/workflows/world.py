@@ -39,7 +39,15 @@ from lidarpose.refine.corner_verdict import (
     judge_corners,
 )
 from lidarpose.refine.face_rims import without_rims
-from lidarpose.refine.ring_offsets import RingOffsets, Rings, find_rings, ring_offsets, some_returns
+from lidarpose.refine.ring_offsets import (
+    RingEquations,
+    RingOffsets,
+    Rings,
+    find_rings,
+    ring_equations,
+    ring_offsets,
+    some_returns,
+)
 from lidarpose.refine.spot_scatter import common_error_factor, spot_scatter, weighed_by_angle
 from lidarpose.refine.wrong_coordinate import unsure_noise, wrong_coordinate
 from lidarpose.solve.corner_alignment import cayley_pose, pair_scale, svd_pose
@@ -487,9 +495,11 @@ def _without_ring_offsets(
     if few_rings is None:
         return fit, used, None, None, None
     estimate, clean, offsets = fit, used, None
-    if ring_offsets(fit, few, few_rings) is not None:
+    equations: RingEquations | None = ring_equations(fit, few, few_rings)
+    if ring_offsets(fit, few, few_rings, equations=equations) is not None:
         estimate, clean, offsets = _with_rings(session, fit, used)
-    crossing = _crossing(session, estimate, clean, few, few_rings, offsets)
+        equations = None
+    crossing = _crossing(session, estimate, clean, few, few_rings, offsets, equations)
     if crossing is not None and crossing.told:
         estimate = replace(estimate, covariance=estimate.covariance + np.outer(crossing.move, crossing.move))
     stated = session.lidar.beam_crossing_m is not None
@@ -504,11 +514,13 @@ def _crossing(
     few: list[CornerPlaceFaces],
     rings: Rings,
     offsets: RingOffsets | None,
+    equations: RingEquations | None,
 ) -> SeenCrossing | None:
-    """Where the beams seem to cross, from some returns `few`; `clean` are all, without offsets of rings."""
+    """Where the beams seem to cross, from some returns `few`, with their `equations` at the fit if these are known;
+    `clean` are all, without offsets of rings."""
     told, ring_sigma_m = (0.0, 0.0) if offsets is None else (offsets.told, offsets.sigma_m)
     factor = common_error_factor(fit, some_returns(clean), told)
-    first = seen_crossing(fit, few, rings, ring_sigma_m, factor)
+    first = seen_crossing(fit, few, rings, ring_sigma_m, factor, equations)
     if first is None or first.told or session.world_sigma_m is not None or not fit.world_sigma_m > 0.0:
         return first
     # What a crossing does has passed for errors of the world's coordinates: are there any where it is taken out?

@@ -11,7 +11,7 @@ from lidarpose.model.calibration import WorldCalibration
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import CornerSession
 from lidarpose.model.world_run import WorldPlace, WorldRun
-from lidarpose.refine.corner_model import CornerFit, place_discrepancies
+from lidarpose.refine.corner_model import CornerFit
 
 # More points than this a face say nothing new to the eye.
 MOST_POINTS_A_FACE = 2000
@@ -33,7 +33,7 @@ def joint_run(
     by_frame
         By position: the corner of each of its frames (F, 3), left out or not.
     """
-    moves, _, known = place_discrepancies(fit)
+    moves, _, known = fit.discrepancies
     own = fit.state.corners(fit.world) + np.where(known[:, None], moves[:, :3], 0.0)
     places = []
     for place, corner in zip(used, own, strict=True):
