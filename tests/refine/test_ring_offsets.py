@@ -158,6 +158,21 @@ def test_directions_that_come_in_no_rings_have_no_offsets() -> None:
     assert find_rings(shaken) is None
 
 
+def test_faces_of_few_returns_tell_neither_offsets_nor_a_crossing() -> None:
+    """The joint estimate stands on a face of which no place has enough returns to be in rings."""
+    rng = np.random.default_rng(8)
+    all_returns = observe(rng, rng.normal(0.0, 0.005, 16))
+    fit = plain(all_returns)
+    places = [
+        replace(p, faces={**p.faces, 0: p.faces[0].subset(np.arange(3) * (len(p.faces[0]) // 3))}) for p in all_returns
+    ]
+    rings = find_rings(places)
+    assert rings is not None
+    rings = replace(rings, numbers={key: ring for key, ring in rings.numbers.items() if key[1] != 0})
+    assert ring_offsets(fit, places, rings) is None
+    assert seen_crossing(fit, places, rings, 0.005, 1.0) is None
+
+
 def test_a_crossing_of_the_beams_is_told_beside_offsets() -> None:
     rng = np.random.default_rng(6)
     for crossing_m in (0.0, 0.04):

@@ -159,6 +159,8 @@ def seen_crossing(
     The crossing; None where the faces do not tell it.
     """
     equations = equations or ring_equations(fit, places, rings)
+    if not equations.determined:
+        return None
     count, n = len(rings.elevation_rad), len(equations.pull)
     corners = fit.state.corners(fit.world)
     jacobians = face_jacobians(list(rings.numbers), fit.state, fit.world, fit.options)

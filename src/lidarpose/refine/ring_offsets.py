@@ -115,6 +115,14 @@ class RingEquations:
     pull: FloatArray
     ring_pull: FloatArray
 
+    @property
+    def determined(self) -> bool:
+        """Whether the returns that are in rings tell all parameters by themselves: faces of few returns are not."""
+        scale = np.sqrt(np.diag(self.parameters))
+        if not scale.min() > 0.0:
+            return False
+        return bool(np.linalg.eigvalsh(self.parameters / np.outer(scale, scale))[0] > 1e-12)
+
     def reduced(self) -> tuple[FloatArray, FloatArray]:
         """Information (K, K) and gradient (K,) of the offsets, the parameters being free."""
         solved = np.linalg.solve(self.parameters, np.column_stack([self.cross, self.pull]))
@@ -180,6 +188,8 @@ def ring_offsets(
     The offsets; None where nothing speaks for any.
     """
     equations = equations or ring_equations(fit, places, rings)
+    if not equations.determined:
+        return None
     information, gradient = equations.reduced()
     if before is not None:
         gradient = gradient + information @ before

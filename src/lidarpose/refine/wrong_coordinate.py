@@ -64,7 +64,8 @@ def wrong_coordinate(fit: CornerFit) -> WrongCoordinate | None:
     for k in range(count):
         mine = slice(3 * k, 3 * k + 3)
         gains[k] = _gain(own[mine, mine], pull[mine])
-        off = np.linalg.solve(own[mine, mine], pull[mine])
+        # A place that lacks a face does not tell all of its coordinates.
+        off = np.linalg.pinv(own[mine, mine], rcond=1e-9, hermitian=True) @ pull[mine]
         moves[k, :errors] = solved[:, -1] - solved[:, mine] @ off
         moves[k, errors:] = -fit.state.world_errors.ravel()
         moves[k, errors:][mine] += off
