@@ -113,6 +113,29 @@ def test_one_wrong_coordinate_is_named_and_in_the_covariance(simulated: Simulate
     assert squared_error(result, truth) < 12.6
 
 
+def test_a_place_that_fits_nothing_is_named() -> None:
+    rng = np.random.default_rng([91, 407])
+    kind = str(rng.choice(["cube", "arrow", "oblique", "concave"]))
+    lidar = str(rng.choice(["hdl32", "vlp16", "turntable"]))
+    pose = Pose(
+        paper_rotation(rng.uniform(-180, 180), rng.uniform(-12, 28), rng.uniform(-10, 10)),
+        np.array([rng.uniform(-1, 1), rng.uniform(-1, 1), 1.5]),
+    )
+    places, frames = int(rng.integers(4, 8)), int(rng.choice([1, 3]))
+    spec = CornerSceneSpec(pose=pose, target=kind, lidar=lidar, places=places, frames=frames, seed=7407)  # type: ignore[arg-type]
+    spec = replace(spec, ground_m=0.0)
+    size_m, room, clutter = float(rng.uniform(0.3, 0.8)), bool(rng.random() < 0.5), int(rng.integers(0, 6))
+    session, truth = simulate_corner_session(replace(spec, size_m=size_m, room=room, clutter=clutter))
+    world = np.stack([p.corner_world for p in session.places])
+    off = int(rng.integers(places))
+    rng.integers(places - 1)
+    direction = rng.normal(size=3)
+    world[off] += 0.1 * direction / np.linalg.norm(direction)
+    result = calibrate_world(with_world(session, world))
+    assert session.places[off].position in reasons(result)
+    assert squared_error(result, truth) < 16.8
+
+
 def test_no_coordinate_is_blamed_where_all_are_uncertain() -> None:
     found = []
     for seed in range(8):

@@ -116,6 +116,7 @@ def judge_corner_fit(
     _judge_turns(verdict, places, moves, statistic, known, evidence)
     _judge_world(verdict, fit, places, evidence)
     _judge_noise(verdict, fit, evidence)
+    _judge_strangers(verdict, places, evidence)
     if evidence.crossing is not None:
         figures["beam_crossing_left_out_mm"] = {
             "value": 1e3 * evidence.crossing.crossing_m,
@@ -130,6 +131,16 @@ def judge_corner_fit(
             "calibrate the turntable with the joint method, whose file holds one"
         )
     return Quality(verdict.verdict, tuple(verdict.reasons), figures)
+
+
+def _judge_strangers(verdict: _Verdict, places: Sequence[CornerPlaceFaces], evidence: CornerEvidence) -> None:
+    """Places of which a face has no return where the estimate has it: they have no say, and no residuals."""
+    strangers = sorted({places[i].position for (i, _), s in (evidence.scatter or {}).items() if s.spots == 0})
+    for position in strangers:
+        verdict.doubt(
+            f"no return from a face at {position} fits the estimate from the other places: its world coordinates are "
+            "far off, or the target was turned there"
+        )
 
 
 def _judge_crossing(verdict: _Verdict, seen: SeenCrossing) -> None:

@@ -41,6 +41,10 @@ def spot_scatter(fit: CornerFit, places: Sequence[CornerPlaceFaces]) -> dict[tup
         for j, returns in place.faces.items():
             residual = face_residuals(returns, fit.state.normals[j], corners[i])
             keep = np.flatnonzero(np.abs(residual) < 4.0 * fit.range_sigma_m)
+            if len(keep) == 0:
+                # A place whose world coordinates are off by decimetres may stand by itself.
+                found[i, j] = SpotScatter(0.0, 0)
+                continue
             cell = direction_cells(returns.rays.take(keep, axis=1), CELL_RAD)
             count = np.bincount(cell)
             mean = np.bincount(cell, residual.take(keep)) / count
