@@ -117,6 +117,22 @@ def test_whole_faces_are_seen_again_by_a_reference_that_shows_a_part_of_them() -
     assert sight_again([bent, *around[1:]], part, CORNERS, part_at=0) is None
 
 
+def test_scan_lines_far_apart_on_a_face_seen_along_do_not_cut_it_short() -> None:
+    rng = np.random.default_rng(5)
+    whole = replace(sighting(rng), support=150)
+    frames = []
+    for k, corner in enumerate(CORNERS):
+        target, _ = cube(corner, rng)
+        top, beyond_m = np.arange(len(target)) < 400, target[:, 0] - corner[0]
+        lines = (np.abs(beyond_m - 0.15) < 0.1) | (np.abs(beyond_m - 0.66) < 0.06)
+        frames.append(seen(ground(rng), target if k else target[~top | lines], corner, whole))
+    around = [surroundings(f, whole, c, 0.4) for f, c in zip(frames, CORNERS, strict=True)]
+    found = sight_again(around, whole, CORNERS, part_at=0)
+    assert found is not None
+    for candidate, corner in zip(found, CORNERS, strict=True):
+        assert np.linalg.norm(candidate.outlines[0] - corner, axis=1).max() > 0.9 * SIZE_M * np.sqrt(2.0)
+
+
 @pytest.mark.parametrize("wrong", ["gone", "a face hidden", "turned"])
 def test_a_target_that_is_not_there_is_not_seen(wrong: str) -> None:
     rng = np.random.default_rng(3)

@@ -115,15 +115,21 @@ def sight_again(
 def _whole(
     local: FloatArray, planes: Sequence[Plane], standing: Sequence[Plane], reference: CornerCandidate
 ) -> CornerCandidate | None:
-    """The reference with whole faces: all that hangs together on each of its planes; None where that is no corner."""
-    everywhere = np.arange(len(local))
+    """The reference with whole faces: all that hangs together on each of its planes; None where that is no corner.
+
+    What its outlines show belongs to it even so: on a face that is seen along, scan lines are far apart.
+    """
+    everywhere, columns, corner = np.arange(len(local)), np.ascontiguousarray(local.T), _meeting(planes)
     patches = _shared_out(local, [(plane, everywhere) for plane in planes], standing, reference.sigma_m)
     single = local.astype(np.float32)
     faces = []
-    for patch in patches[:3]:
+    for k, patch in enumerate(patches[:3]):
         mine = np.zeros(len(local), dtype=bool)
         mine[patch.indices] = True
-        together = np.flatnonzero(largest_component(single, mine, patch.plane))
+        whole = largest_component(single, mine, patch.plane)
+        shown = _over_outline(columns, reference, k, corner, BORDER_M)[0]
+        whole[shown[mine[shown]]] = True
+        together = np.flatnonzero(whole)
         if len(together) < FEWEST:
             return None
         faces.append(replace(patch, indices=together))

@@ -45,7 +45,7 @@ def ransac_corner(points: FloatArray, sighting: CornerCandidate, *, seed: int, s
         Whether to fit again to the points whose local normal agrees with the plane's.
     """
     reach = min(float(np.linalg.norm(o - sighting.corner, axis=1).max()) for o in sighting.outlines)
-    region = points[np.linalg.norm(points - sighting.corner, axis=1) < min(0.85 * reach, 0.6)]
+    region = points[np.linalg.norm(points - sighting.corner, axis=1) < min(reach, 0.6)]
     for ground in sighting.obstacles:
         region = region[ground.distance(region) > GROUND_CLEARANCE_M]
     rng = np.random.default_rng(seed)
