@@ -100,3 +100,25 @@ def test_ground_that_one_place_takes_for_a_face_is_left_out() -> None:
     left = without_rims(found, NORMALS, CORNERS, SIGMA_M)[1].faces[0]
     assert 1300 < len(left) <= 1510
     assert np.count_nonzero(np.isin(left.range_m, measured)) <= 10
+
+
+def repeated(place: CornerPlaceFaces, frames: int, rng: np.random.Generator) -> CornerPlaceFaces:
+    """The place seen in many frames by beams that go the same ways, but for the rounding of what they return."""
+    faces = {}
+    for j, f in place.faces.items():
+        directions = unit(np.tile(f.directions, (frames, 1)) * rng.uniform(0.5, 2.0, (frames * len(f), 1)))
+        range_m = np.tile(f.range_m, frames) + rng.normal(0.0, SIGMA_M, frames * len(f))
+        faces[j] = FaceReturns(directions, range_m, np.repeat(np.arange(frames), len(f)))
+    return CornerPlaceFaces(place.position, place.corner_world, faces, frames)
+
+
+@pytest.mark.parametrize("slope", [0.0, 2.0])
+def test_beams_that_repeat_are_kept_together_whatever_the_last_digit(slope: float) -> None:
+    rng = np.random.default_rng(5)
+    found = [repeated(p, 10, rng) for p in places(slope, 5)]
+    plain = without_rims(found, NORMALS, CORNERS, SIGMA_M)
+    for _ in range(5):
+        off = 1e-13 * rng.standard_normal((3, 3))
+        again = without_rims(found, NORMALS + off, CORNERS, SIGMA_M)
+        for before, after in zip(plain, again, strict=True):
+            assert all(np.array_equal(before.faces[j].range_m, after.faces[j].range_m) for j in range(3))

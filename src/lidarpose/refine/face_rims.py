@@ -25,6 +25,9 @@ STRIP_M, STRIP_SHARE = 0.04, 0.2
 # A mean of so many standard deviations is no noise: chance makes one on a side in fifty.
 STEP_SIGMAS = 3.0
 CLIP_SIGMAS = 4.0
+# Beams that a LiDAR repeats frame by frame are as far out but for rounding, single precision's where clouds hold that:
+# as far as they are taken to be, and no more than this share of the mean spacing.
+TIED_RAD, TIED_SHARE = 1e-6, 0.1
 # Half a beam's width, and a little: a beam this far inside a side meets the face alone.
 GUARD_M, GUARD_RAD = 0.002, 0.0015
 MOST_GRAZING, GUARD_SHARE = 0.2, 0.1
@@ -187,10 +190,7 @@ def _inside(face: _Face, sides: Sequence[_Side], step_sigmas: float) -> BoolArra
         strip = strip[inside.take(strip)]
         if len(strip) == 0:
             continue
-        strip = strip[np.argsort(inwards.take(strip))]
-        sums = np.abs(np.cumsum(face.residual.take(strip))) / np.sqrt(np.arange(1, len(strip) + 1))
-        step = int(np.argmax(sums))
-        end = inwards[strip[step if sums[step] > step_sigmas else 0]]
+        end = _end_of_foreign(face, inwards, strip, step_sigmas)
         # A beam's width is stretched where it meets the face at a grazing angle.
         seen = np.sqrt(1.0 - (face.toward @ side.outward) ** 2)
         guard = (GUARD_M + GUARD_RAD * face.distance_m) / np.maximum(seen, MOST_GRAZING)
@@ -200,9 +200,23 @@ def _inside(face: _Face, sides: Sequence[_Side], step_sigmas: float) -> BoolArra
     return inside
 
 
+def _end_of_foreign(face: _Face, inwards: FloatArray, strip: IntArray, step_sigmas: float) -> float:
+    """How far inwards (m) reaches what is off the face among some returns (M,) of a side; if none is, its outermost.
+
+    Returns of one beam are told apart by rounding alone: they are foreign together or not at all.
+    """
+    strip = strip[np.argsort(inwards.take(strip))]
+    ordered = inwards.take(strip)
+    tied_m = min(TIED_RAD * float(face.distance_m.min()), TIED_SHARE * float(ordered[-1] - ordered[0]) / len(ordered))
+    last = np.append(np.flatnonzero(np.diff(ordered) > tied_m), len(ordered) - 1)
+    sums = np.abs(np.cumsum(face.residual.take(strip)).take(last)) / np.sqrt(last + 1.0)
+    step = int(np.argmax(sums))
+    return float(ordered[last[step if sums[step] > step_sigmas else 0]])
+
+
 def _foreign_beyond(face: _Face, inwards: FloatArray, step_sigmas: float) -> IntArray:
     """Which returns (M,) lie farther out than half of the places reach, at places where these are off the face."""
-    beyond = np.flatnonzero(inwards < 0.0)
+    beyond = np.flatnonzero(inwards < -TIED_RAD * face.distance_m.min())
     place = face.place.take(beyond)
     count = np.bincount(place, minlength=len(face.distance_m))
     total = np.bincount(place, face.residual.take(beyond), len(face.distance_m))
