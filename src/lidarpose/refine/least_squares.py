@@ -64,6 +64,17 @@ def line_moments(columns: FloatArray, weight: FloatArray, start: IntArray) -> Fl
     return out
 
 
+def moved_moments(moments: FloatArray, shift: FloatArray) -> FloatArray:
+    """`line_moments` (S, b + 3, b + 3) after the residuals grew by the basis times `shift` (S, b), weights held."""
+    b = shift.shape[1]
+    out = moments.copy()
+    with_residual = (moments[:, :, :b] @ shift[:, :, None])[:, :, 0]
+    out[:, :, -1] += with_residual
+    out[:, -1, :] += with_residual
+    out[:, -1, -1] += (with_residual[:, :b] * shift).sum(axis=1)
+    return out
+
+
 def own_effects(moments: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Least-squares shift and slope (S, 2) of each line by itself, and where there is one."""
     size = moments.shape[1]

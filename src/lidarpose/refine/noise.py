@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
 
 import numpy as np
 
-from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.robust import mad_sigma
 
 CORE = 2.5
@@ -107,9 +108,8 @@ def rows_that_count_as_one(psi: FloatArray, line_of_row: IntArray, parameters: f
         return 1.0
     square = float((psi * psi).sum()) / n
     taken = parameters / (n - parameters)
-    products, counts = (_sums_at_lags(values, line_of_row) for values in (psi, used.astype(np.float64)))
     total, share = 0.0, 1.0
-    for product, pairs in zip(products.tolist(), np.rint(counts).tolist(), strict=True):
+    for product, pairs in _sums_at_lags(psi, used, line_of_row):
         if pairs < 20:
             break
         correlation = product / pairs / square + taken
@@ -120,23 +120,19 @@ def rows_that_count_as_one(psi: FloatArray, line_of_row: IntArray, parameters: f
     return 1.0 + 2.0 * total
 
 
-def _sums_at_lags(values: FloatArray, line_of_row: IntArray) -> FloatArray:
-    """Sums (L,) of values (N,) times those 1, 2, ... rows further on in the same line; lines follow one another.
+def _sums_at_lags(values: FloatArray, used: BoolArray, line_of_row: IntArray) -> Iterator[tuple[float, int]]:
+    """Sums of values (N,) times those 1, 2, ... rows further on in the same line, and how many of both are used.
 
-    By the Fourier transform, with so many zeros between lines that none meets the next.
+    Lines follow one another; between them stand so many zeros that none meets the next.
     """
     line = line_of_row - line_of_row[0]
     lags = min(_MOST_LAGS, int(np.bincount(line).max()))
-    spread = np.zeros(_smooth_size(len(values) + lags * (int(line[-1]) + 1)))
-    spread[np.arange(len(values)) + lags * line] = values
-    spectrum = np.fft.rfft(spread)
-    return np.asarray(np.fft.irfft(spectrum.real**2 + spectrum.imag**2, len(spread))[1 : lags + 1])
-
-
-def _smooth_size(least: int) -> int:
-    """The next size of a few bits and then zeros: the transform of a size with large factors is slow."""
-    step = 1 << max(least.bit_length() - 4, 0)
-    return -(-least // step) * step
+    at = np.arange(len(values)) + lags * line
+    spread, there = np.zeros(int(at[-1]) + 1), np.zeros(int(at[-1]) + 1, dtype=bool)
+    spread[at], there[at] = values, used
+    for lag in range(1, lags + 1):
+        # Not by BLAS, which would wake threads for so long a sum.
+        yield float(np.einsum("i,i->", spread[lag:], spread[:-lag])), int(np.count_nonzero(there[lag:] & there[:-lag]))
 
 
 _SCATTER_BINS = 8

@@ -26,6 +26,7 @@ from lidarpose.refine.least_squares import (
     add_lines,
     covariance_and_condition,
     line_moments,
+    moved_moments,
     own_effects,
     take_out_effects,
 )
@@ -93,11 +94,15 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Residuals and derivatives at one state."""
+    """Residuals and derivatives at one state.
+
+    `strayed`: how far small steps have led since the derivatives were taken (m, rad and the extras' units), at most.
+    """
 
     state: JointState
     corners: tuple[CornerResiduals, ...]
     lines: Mapping[Kind, LineResiduals]
+    strayed: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +225,8 @@ def _solve(data: JointData, start: JointState, active: IntArray, max_iterations:
     noise = done.noise
     if not with_places:
         moments = all_moments(data, done.at, noise)
-        noise = update_noise(data, done.at, noise, moments, active, soft=False, with_places=True)
+        information = _restricted(normal_equations(data, done.at, noise, moments), active).information
+        noise = update_noise(data, done.at, noise, moments, information, active, soft=False, with_places=True)
     whole = linearise(data, done.at.state)
     return _finish(data, whole, noise, active, spent + done.iterations, done.converged)
 
@@ -272,20 +278,27 @@ def _iterate(
     """Steps until neither parameters nor noise move. `earlier`: the noise of a nearly finished estimate."""
     at = linearise(data, start, active)
     noise = first_noise(data, at) if earlier is None else carried_over(data, at, earlier)
-    soft_until, places_from, least = (3, 8, 10) if earlier is None else (0, 0, 2)
-    damping, calm, iteration = 1e-6, 0, 0
+    soft_until, least = (_SOFT_STEPS, _SOFT_STEPS) if earlier is None else (0, 2)
+    damping, calm, iteration, places = 1e-6, 0, 0, with_places and earlier is not None
     moments = all_moments(data, at, noise)
     for iteration in range(1, max_iterations + 1):
         equations = _restricted(normal_equations(data, at, noise, moments), active)
-        at, moments, damping, decrease = _damped_step(data, at, noise, equations, active, damping)
-        old = noise
-        soft, places = iteration <= soft_until, with_places and iteration >= places_from
-        noise = update_noise(data, at, noise, moments, active, soft=soft, with_places=places)
+        at, moments, damping, decrease = _damped_step(data, at, noise, moments, equations, active, damping)
+        old, soft = noise, iteration <= soft_until
+        noise = update_noise(data, at, noise, moments, equations.information, active, soft=soft, with_places=places)
         moments = all_moments(data, at, noise)
         calm = calm + 1 if decrease < 1e-3 and _noise_change(old, noise) < 1e-2 else 0
+        # What whole lines are off by can be told once all else has settled.
+        if with_places and not places and not soft and (calm or iteration >= _STEPS_WITHOUT_PLACES):
+            places, calm = True, 0
         if calm >= (2 if earlier is None else 1) and iteration >= least:
             return _Progress(at, noise, iteration, True)
     return _Progress(at, noise, iteration, False)
+
+
+_SOFT_STEPS = 3
+"""First steps that take Huber's weights."""
+_STEPS_WITHOUT_PLACES = 7
 
 
 def _require_enough(data: JointData) -> None:
@@ -315,7 +328,13 @@ def _restricted(equations: NormalEquations, active: IntArray) -> NormalEquations
 
 
 def _damped_step(
-    data: JointData, at: Linearised, noise: Noise, equations: NormalEquations, active: IntArray, damping: float
+    data: JointData,
+    at: Linearised,
+    noise: Noise,
+    moments: Moments,
+    equations: NormalEquations,
+    active: IntArray,
+    damping: float,
 ) -> tuple[Linearised, Moments, float, float]:
     """One accepted step, or none: the new point, its moments, the next damping, and how much the cost was to fall."""
     for _ in range(12):
@@ -323,15 +342,38 @@ def _damped_step(
         full = np.zeros(N_GLOBAL + 6 * len(data.slots))
         full[active] = step
         expected = float(step @ equations.gradient)
-        new = linearise(data, at.state.moved(full, data.centres), active)
-        moments = all_moments(data, new, noise)
-        cost = sum_of_squares(data, new, noise, moments)
+        state, strayed = at.state.moved(full, data.centres), at.strayed + float(np.abs(step).max())
+        if strayed < _STRAIGHT:
+            new, new_moments = _moved(data, at, state, full, moments, strayed)
+        else:
+            new = linearise(data, state, active)
+            new_moments = all_moments(data, new, noise)
+        cost = sum_of_squares(data, new, noise, new_moments)
         if cost <= equations.sum_of_squares * (1.0 + 1e-9) + 1e-9:
-            return new, moments, max(damping * 0.1, 1e-12), expected
+            return new, new_moments, max(damping * 0.1, 1e-12), expected
         if expected < 1e-6:
             break
         damping = max(damping, 1e-9) * 10.0
-    return at, all_moments(data, at, noise), damping, 0.0
+    return at, moments, damping, 0.0
+
+
+_STRAIGHT = 1e-4
+"""Steps that lead no further than this (m, rad) since derivatives were taken are taken to first order: the second order
+moves a line some metres away by less than a ten-thousandth of a millimetre."""
+
+
+def _moved(
+    data: JointData, at: Linearised, state: JointState, step: FloatArray, moments: Moments, strayed: float
+) -> tuple[Linearised, Moments]:
+    """Residuals and moments after a small step (n,) of all parameters to a state, to first order."""
+    lines: dict[Kind, LineResiduals] = {}
+    moved: Moments = {}
+    for kind, residuals in at.lines.items():
+        layout = lines_of(data, kind)
+        shift = residuals.shift_by(step, layout.slot)
+        lines[kind] = residuals.moved(shift, layout.line_of_row)
+        moved[kind] = moved_moments(moments[kind], shift)
+    return Linearised(state, tuple(c.moved(step, k) for k, c in enumerate(at.corners)), lines, strayed), moved
 
 
 # --- normal equations -----------------------------------------------------------------------------------------------
@@ -485,13 +527,16 @@ def update_noise(
     at: Linearised,
     noise: Noise,
     moments: Moments,
+    information: FloatArray,
     active: IntArray,
     *,
     soft: bool,
     with_places: bool,
 ) -> Noise:
-    """New factors, place variances and weights at the present residuals; `moments` are those of the old noise."""
-    information = normal_equations(data, at, noise, moments).information[np.ix_(active, active)]
+    """New factors, place variances and weights at the present residuals.
+
+    `moments` and `information` (n, n) on the active parameters are those of the old noise.
+    """
     covariance, _, _ = covariance_and_condition(information)
     full = np.zeros((N_GLOBAL + 6 * len(data.slots),) * 2)
     full[np.ix_(active, active)] = covariance

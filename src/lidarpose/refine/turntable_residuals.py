@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.se3 import Pose, skew
 from lidarpose.model.camera import Camera
 from lidarpose.refine.least_squares import line_columns
@@ -49,6 +49,22 @@ class LineResiduals:
     def basis(self) -> FloatArray:
         return self.columns[:, :-3]
 
+    def shift_by(self, step: FloatArray, slot: IntArray) -> FloatArray:
+        """By how much a step (n,) of all parameters moves the basis' coefficients (S, b) of lines on panels (S,)."""
+        of_panel = step[N_GLOBAL:].reshape(-1, 6)[slot]
+        return np.asarray(self.to_parameters[:, :, :N_GLOBAL] @ step[:N_GLOBAL]) + np.asarray(
+            (self.to_parameters[:, :, N_GLOBAL:] @ of_panel[:, :, None])[:, :, 0]
+        )
+
+    def moved(self, shift: FloatArray, line_of_row: IntArray) -> LineResiduals:
+        """The same after a small step, its coefficients (S, b) given, to first order."""
+        residual = self.residual.copy()
+        for k in range(shift.shape[1]):
+            residual += self.columns[:, k] * shift[line_of_row, k]
+        columns = self.columns.copy()
+        columns[:, -1] = residual
+        return LineResiduals(residual, columns, self.to_parameters, self.valid)
+
 
 @dataclass(frozen=True, eq=False)
 class CornerResiduals:
@@ -56,6 +72,11 @@ class CornerResiduals:
 
     residual: FloatArray
     jacobian: FloatArray
+
+    def moved(self, step: FloatArray, k: int) -> CornerResiduals:
+        """Those of panel k after a small step (n,) of all parameters, to first order."""
+        own = np.concatenate([step[N_GLOBAL + 6 * k : N_GLOBAL + 6 * k + 6], step[np.array(CAMERA_EXTRAS)]])
+        return CornerResiduals(self.residual + self.jacobian @ own, self.jacobian)
 
 
 def corner_residuals(data: JointData, state: JointState, k: int) -> CornerResiduals:
