@@ -60,10 +60,15 @@ def test_the_same_beams_are_of_each_face(convex: bool, gate_m: float) -> None:
     assert selected > 3000
 
 
+@pytest.mark.parametrize("columns", [3, 4, 7])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_same_points_are_in_a_box(dtype: type[np.floating[Any]]) -> None:
+def test_the_same_points_are_in_a_box(dtype: type[np.floating[Any]], columns: int) -> None:
     rng = np.random.default_rng(6)
-    points = rng.uniform(-4.0, 4.0, (20_000, 3)).astype(dtype)
+    # As a file has them, with other columns beside; the last row ends with the last point's z.
+    memory = rng.uniform(-4.0, 4.0, 20_000 * columns).astype(dtype)
+    points = np.lib.stride_tricks.as_strided(
+        memory[columns - 3 :], (20_000, 3), (columns * memory.itemsize, memory.itemsize)
+    )
     points[::7] = np.nan
     points[::11, 1] = np.inf
     points[5], points[6] = [0.5, 1.0, -2.0], [1.5, 2.0, -1.0]  # just on the border, which is not inside

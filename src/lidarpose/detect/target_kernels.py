@@ -13,28 +13,63 @@ import numpy as np
 
 from lidarpose.geometry.compiled import kernel
 
+# Points are asked so many at a time: most hold none that is wanted.
+_BLOCK = 256
+
 
 @kernel
-def points_in_box(points: Any, order: Any, middle: Any, half: Any) -> Any:
-    """Those (M, 3) of points (N, 3) that lie within `half` (3,) of `middle` (3,), coordinates asked in the order."""
-    first, second, third = order[0], order[1], order[2]
-    index = np.empty(len(points) + 1, np.uint32)
-    found = np.uint64(0)
-    for k in range(len(points)):
-        index[found] = k
-        found += np.uint64(abs(points[k, first] - middle[first]) < half[first])
-    kept = np.uint64(0)
-    for j in range(found):
-        i = np.uint64(index[np.uint64(j)])
-        index[kept] = i
-        near = abs(points[i, second] - middle[second]) < half[second]
-        kept += np.uint64(near and abs(points[i, third] - middle[third]) < half[third])
-    inside = np.empty((np.int64(kept), 3), points.dtype)
-    for j in range(len(inside)):
-        i = np.uint64(index[np.uint64(j)])
-        for axis in range(3):
-            inside[j, axis] = points[i, axis]
-    return inside
+def _flagged(flat: Any, start: int, count: int, middle: Any, half: Any, flags: Any) -> Any:
+    """Flag those of the first `count` points, x, y, z after one another from a start, that are in a box; how many."""
+    a, b, c = middle[0], middle[1], middle[2]
+    p, q, r = half[0], half[1], half[2]
+    # Flags as wide as coordinates, and places without a sign: that goes in vector instructions.
+    found = np.int32(0)
+    for k in range(count):
+        i = np.uint64(start) + np.uint64(3) * np.uint64(k)
+        x, y, z = flat[i] - a, flat[i + np.uint64(1)] - b, flat[i + np.uint64(2)] - c
+        flags[k] = np.int32((abs(x) < p) & (abs(y) < q) & (abs(z) < r))
+        found += flags[k]
+    return found
+
+
+@kernel
+def points_in_box(flat: Any, step: int, count: int, middle: Any, half: Any) -> Any:
+    """Those (M, 3) of `count` points that lie within `half` (3,) of `middle` (3,).
+
+    The points stand in `flat`, so many numbers apart, three and more, x, y and z of each side by side.
+    """
+    room = 4 * _BLOCK
+    inside = np.empty(3 * room, flat.dtype)
+    block = np.empty(3 * _BLOCK, flat.dtype)
+    flags, index = np.empty(_BLOCK, np.int32), np.empty(_BLOCK + 1, np.uint32)
+    kept = 0
+    for first in range(0, count, _BLOCK):
+        few = min(_BLOCK, count - first)
+        some, start = flat, 3 * first
+        if step != 3:
+            for k in range(few):
+                for axis in range(3):
+                    block[3 * k + axis] = flat[(first + k) * step + axis]
+            some, start = block, 0
+        found = _flagged(some, start, few, middle, half, flags)
+        if found == 0:
+            continue
+        if kept + found > room:
+            room *= 2
+            more = np.empty(3 * room, flat.dtype)
+            for j in range(3 * kept):
+                more[j] = inside[j]
+            inside = more
+        last = np.uint64(0)
+        for k in range(few):
+            index[last] = k
+            last += np.uint64(flags[k])
+        for j in range(found):
+            i, o = np.uint64(start) + np.uint64(3) * np.uint64(index[j]), np.uint64(3 * (kept + j))
+            for axis in range(3):
+                inside[o + np.uint64(axis)] = some[i + np.uint64(axis)]
+        kept += found
+    return inside[: 3 * kept].copy().reshape((kept, 3))
 
 
 @kernel
