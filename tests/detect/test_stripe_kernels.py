@@ -1,4 +1,4 @@
-"""Stripes found by compiled kernels: the very bits that NumPy finds."""
+"""Stripes found by compiled kernels: the same that NumPy finds, but for rounding."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import pytest
 
 from lidarpose.detect.chessboard import find_panels
 from lidarpose.detect.laser_stripe import StripeDetection, StripeFinder
+from lidarpose.detect.stripe_noise import Samples, learn_noise
 from lidarpose.detect.stripe_search import parabola, reduce_image
 from lidarpose.geometry import compiled
 
 pytestmark = pytest.mark.skipif(not compiled.installed(), reason="numba is not installed")
 
 AZIMUTHS_DEG = (90.0, 75.0, 130.0, 5.0)
+# Pixels have single precision, to which both ways round alike; sums over profiles are double, in another order.
+ROUNDING_PX = 1e-9
 
 
 @pytest.fixture(scope="module")
@@ -46,29 +49,43 @@ def found_in(way: bool, two_panels, shots, images) -> list[StripeDetection]:
         return finder.find_in(images)
 
 
-def test_both_ways_find_the_same_bits(two_panels, shots, images) -> None:
-    ours, theirs = (found_in(way, two_panels, shots, images) for way in (True, False))
-    stripes = 0
+def assert_alike(ours: list[StripeDetection], theirs: list[StripeDetection]) -> int:
+    """Returns how many stripes there are."""
     for one, other in zip(ours, theirs, strict=True):
         assert one.problems == other.problems
         assert one.stripes.keys() == other.stripes.keys()
         for k, points in one.stripes.items():
-            stripes += 1
             for part in ("pixels", "normals", "sigma_px"):
-                np.testing.assert_array_equal(getattr(points, part), getattr(other.stripes[k], part))
-    assert stripes >= 10
+                np.testing.assert_allclose(
+                    getattr(points, part), getattr(other.stripes[k], part), rtol=0.0, atol=ROUNDING_PX
+                )
+    return sum(len(found.stripes) for found in ours)
+
+
+def test_both_ways_find_the_same(two_panels, shots, images) -> None:
+    ours, theirs = (found_in(way, two_panels, shots, images) for way in (True, False))
+    assert assert_alike(ours, theirs) >= 10
 
 
 def test_sixteen_bits_too(two_panels, shots, images) -> None:
     wide = [np.asarray(image, np.uint16) * np.uint16(200) for image in images[:6]]
     bright = [np.asarray(shot, np.uint16) * np.uint16(200) for shot in shots]
     ours, theirs = (found_in(way, two_panels, bright, wide) for way in (True, False))
-    assert sum(len(found.stripes) for found in ours) > 5
-    for one, other in zip(ours, theirs, strict=True):
-        assert one.problems == other.problems
-        for k, points in one.stripes.items():
-            np.testing.assert_array_equal(points.pixels, other.stripes[k].pixels)
-            np.testing.assert_array_equal(points.sigma_px, other.stripes[k].sigma_px)
+    assert assert_alike(ours, theirs) > 5
+
+
+@pytest.mark.parametrize("factor", [0.3, 0.05])
+def test_faint_stripes_are_given_up_alike(two_panels, shots, factor: float) -> None:
+    """What is too faint, too short or too rough: every decision on the way falls the same."""
+    rng = np.random.default_rng(23)
+    dim = []
+    for level in (4.0, 8.0, 14.0, 22.0, 40.0):
+        clean = two_panels.stripe(np.array([0.0, 1.0, 0.1]) / np.hypot(1.0, 0.1), 0.113, 0.0011, level)
+        clean[:, int(factor * two_panels.width) :] *= 0.1
+        dim.append(two_panels.noisy(clean, rng))
+    ours, theirs = (found_in(way, two_panels, shots, dim) for way in (True, False))
+    assert_alike(ours, theirs)
+    assert any(found.problems for found in ours)
 
 
 @pytest.mark.parametrize("factor", [2, 3, 4])
@@ -90,3 +107,33 @@ def test_a_parabola_is_the_least_squares_fit() -> None:
     y = np.rint(40.0 + 0.3 * t - 1e-3 * t**2 + rng.normal(size=60)).astype(int)
     sums = [int((t**k).sum()) for k in range(5)] + [int((y * t**k).sum()) for k in range(3)]
     np.testing.assert_allclose(parabola(*sums), np.polynomial.polynomial.polyfit(t, y, 2), rtol=1e-6)
+
+
+def test_the_noise_is_learnt_alike_from_bands_of_all_sizes() -> None:
+    rng = np.random.default_rng(4)
+    shape = (19, 5, 130)
+    signal = rng.gamma(0.5, 40.0, shape)
+    level = signal + rng.gamma(2.0, 3.0, shape)
+    residual = rng.normal(size=shape) * np.sqrt(2.0 + 0.3 * level + (0.2 * signal) ** 2)
+    good = rng.random(shape) < np.array([0.9, 0.5, 0.1, 0.03, 0.0])[:, None]
+    samples = Samples.of(good.astype(np.float32), [x.astype(np.float32) for x in (residual, level, signal)])
+    before = np.full((5, 3), 7.0)
+    found = []
+    for way in (True, False):
+        with compiled.forced(way):
+            found.append(learn_noise(samples, before))
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-9)
+    assert (found[0][3:] == 7.0).all()
+    reading, shots, speckle = found[0][0]
+    stated = reading + shots * level + speckle * signal**2
+    assert np.median(stated / (2.0 + 0.3 * level + (0.2 * signal) ** 2)) == pytest.approx(1.0, abs=0.25)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 100, 1001])
+def test_selecting_is_as_sorting(count: int) -> None:
+    from lidarpose.detect.stripe_profile_kernels import select
+
+    rng = np.random.default_rng(count)
+    for values in (rng.random(count), rng.integers(0, 5, count).astype(float), np.arange(count, dtype=float)):
+        for k in {0, count // 3, count - 1}:
+            assert select(values.copy(), count, k) == np.sort(values)[k]

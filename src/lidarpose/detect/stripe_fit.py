@@ -36,9 +36,9 @@ from lidarpose.detect.stripe_bands import (
     spreads,
     usable_ranges,
 )
-from lidarpose.detect.stripe_noise import NOISE_SAMPLES, learn_noise, sampled
+from lidarpose.detect.stripe_noise import NOISE_SAMPLES, Samples, learn_noise
 from lidarpose.detect.stripe_search import KERNELS, CoarseLine, PanelView
-from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.robust import MAD_TO_SIGMA, tukey_weights
 from lidarpose.model.image import GrayImage
@@ -91,6 +91,8 @@ _NO_RIDGE = "no stripe on the panel: the bright line is not a narrow ridge"
 _TOO_FEW = "no stripe on the panel: too few profiles show it"
 _TOO_ROUGH = "no usable stripe on the panel: what there is of it is too faint and rough to tell where it runs"
 _NOT_NARROW = "the bright line on the panel is not the narrow straight line that a laser makes"
+# `stripe_profile_kernels` counts them so too.
+_PROBLEMS = ("", _TOO_FEW, _NOT_NARROW, _TOO_ROUGH)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,13 +113,13 @@ class _State:
 class _Smooth:
     """Smooth curves through the centres, the weight (B, N) that each profile is left with, and its residual (B, N).
 
-    `problems` are why a band shows no stripe, empty where it does.
+    `problems` (B,) are why a band shows no stripe: which of `_PROBLEMS`, 0 where it does.
     """
 
     curves: Curves
     weight: FloatArray
     residual: FloatArray
-    problems: list[str]
+    problems: IntArray
 
 
 def fit_stripes(
@@ -179,7 +181,7 @@ def _fit_near(source: Source, ranges: Ranges, few: Ranges, curves: Curves, width
     state = _settle(bands, state, curves, learn_at=1, least=2)
     smooth = _smooth(bands, state)
     state = replace(state, dark_ratio=_dark_ratios(bands, state))
-    return [problem or _points(bands, smooth, source.steep, state, b) for b, problem in enumerate(smooth.problems)]
+    return _merged(bands, smooth, source.steep, state)
 
 
 def _settle(bands: Bands, state: _State, curves: Curves, *, learn_at: int, least: int) -> _State:
@@ -188,6 +190,8 @@ def _settle(bands: Bands, state: _State, curves: Curves, *, learn_at: int, least
     Two steps do for most; it is saturated stripes, of which only the skirts are seen, that take more. A band that has
     settled is left as it is, so that the others do not matter to it.
     """
+    if pays(0.0, KERNELS):
+        return _settle_compiled(bands, state, curves, learn_at=learn_at, least=least)
     moving = np.ones(len(state.width), dtype=bool)
     for step in range(_MOST_STEPS):
         after = _step(bands, state, curves, learn=step == learn_at)
@@ -195,6 +199,23 @@ def _settle(bands: Bands, state: _State, curves: Curves, *, learn_at: int, least
         state = after if moving.all() else _chosen(moving, after, state)
         if step + 1 >= least:
             moving = moving & ~settled
+        if not moving.any():
+            break
+    return state
+
+
+def _settle_compiled(bands: Bands, state: _State, curves: Curves, *, learn_at: int, least: int) -> _State:
+    """`_settle` by kernels."""
+    from lidarpose.detect import stripe_profile_kernels
+
+    state = _State(**{entry.name: np.array(getattr(state, entry.name), dtype=np.float64) for entry in fields(_State)})
+    unknowns = (state.height, state.centre, state.background, state.width, state.information)
+    pull = (curves.at(bands.u), 1.0 / _PULL_PX**2, _SETTLED_SIGMAS, _SETTLED_WIDTH)
+    moving = np.ones(len(state.width), dtype=bool)
+    for step in range(_MOST_STEPS):
+        rows, state.noise[:] = _sums_compiled(bands, state, learn=step == learn_at)
+        stripe_profile_kernels.take_step(rows, bands.valid, *pull, moving, *unknowns)
+        moving |= step + 1 < least
         if not moving.any():
             break
     return state
@@ -219,6 +240,8 @@ def _chosen(which: BoolArray, a: _State, b: _State) -> _State:
 def _first_curves(bands: Bands, share: FloatArray, straight: Curves) -> tuple[Curves, FloatArray, BoolArray]:
     """Curves within about a pixel, from the brightest pixel of each profile, the stripes' rough widths (B,), and
     whether there is a ridge at all (B,)."""
+    if pays(0.0, KERNELS):
+        return _first_curves_compiled(bands, share, straight)
     rest = bands.values - for_table(share) * bands.bright
     rest -= rest.mean(axis=0)
     smooth = rest.copy()
@@ -239,6 +262,17 @@ def _first_curves(bands: Bands, share: FloatArray, straight: Curves) -> tuple[Cu
     # Speckle makes the highest pixel too high, by this much typically, and the width too small.
     width = 1.15 * quantiles(area * cosine, near, 0.5) / np.sqrt(2.0 * np.pi)
     return curves, np.clip(width, 0.6, 6.0), is_ridge
+
+
+def _first_curves_compiled(bands: Bands, share: FloatArray, straight: Curves) -> tuple[Curves, FloatArray, BoolArray]:
+    """`_first_curves` by kernels."""
+    from lidarpose.detect import stripe_profile_kernels
+
+    found = np.empty((len(share), 7))
+    tables = (bands.values, bands.bright, np.asarray(share, dtype=np.float32))
+    profiles = (bands.v[0], bands.u, bands.valid, straight.at(bands.u))
+    stripe_profile_kernels.first_curves(*tables, *profiles, _MIN_POINTS, found)
+    return Curves(found[:, :3], found[:, 3:4], found[:, 4:5]), found[:, 5], found[:, 6] > 0.0
 
 
 def _start(bands: Bands, curves: Curves, width: FloatArray, ratio: FloatArray, noise: FloatArray | None) -> _State:
@@ -286,7 +320,7 @@ def _bell_compiled(bands: Bands, centre: FloatArray, width: FloatArray) -> Float
 
 def _step(bands: Bands, state: _State, curves: Curves, *, learn: bool) -> _State:
     """One Gauss-Newton step; with `learn`, the noise is learnt again first."""
-    M, noise = (_equations_compiled if pays(0.0, KERNELS) else _equations)(bands, state, learn=learn)
+    M, noise = _equations(bands, state, learn=learn)
     M[_BACKGROUND][0] += 1e-9
     M[_HEIGHT][0] += 1e-9
     M[_CENTRE][0] += 1.0 / _PULL_PX**2
@@ -315,8 +349,7 @@ def _equations(bands: Bands, state: _State, *, learn: bool) -> tuple[list[FloatA
     level = np.maximum(bands.values + bands.ambient, np.float32(0.0))
     noise = state.noise
     if learn:
-        samples = [tuple(x[:, b].ravel()[k] for x in (residual, level, signal)) for b, k in sampled(bands.good)]
-        noise = learn_noise(samples, state.noise)
+        noise = learn_noise(Samples.of(bands.good, (residual, level, signal)), state.noise)
     variance = for_table(noise[:, 0]) + for_table(noise[:, 1]) * level + for_table(noise[:, 2]) * signal * signal
     weight = bands.good / variance
     J = [
@@ -328,8 +361,8 @@ def _equations(bands: Bands, state: _State, *, learn: bool) -> tuple[list[FloatA
     return _normal_equations(J, residual, weight), noise
 
 
-def _equations_compiled(bands: Bands, state: _State, *, learn: bool) -> tuple[list[FloatArray], FloatArray]:
-    """`_equations` by kernels."""
+def _sums_compiled(bands: Bands, state: _State, *, learn: bool) -> tuple[FloatArray, FloatArray]:
+    """The sums of `_normal_equations` (14, B, N), one row after the other, and the noise (B, 3), by kernels."""
     from lidarpose.detect import stripe_kernels
 
     bell = _bell_compiled(bands, state.centre, state.width)
@@ -343,19 +376,17 @@ def _equations_compiled(bands: Bands, state: _State, *, learn: bool) -> tuple[li
     centre, cosine, slant, height, background = (for_table(x) for x in profiles)
     tables = (bands.v, bands.values, bands.ambient, bands.good, bands.light, bell)
     stripe_kernels.normal_equations(*tables, centre, cosine, slant, height, background, each, rows)
-    doubles = rows.astype(np.float64)
-    return [doubles[a:b] for a, b in ((0, 5), (5, 9), (9, 12), (12, 14))], noise
+    return rows, noise
 
 
-def _samples(bands: Bands, state: _State, bell: FloatArray) -> list[tuple[FloatArray, ...]]:
+def _samples(bands: Bands, state: _State, bell: FloatArray) -> Samples:
     """Residual, level and signal of some pixels of each band, as `_equations` has them of all, by kernels."""
     from lidarpose.detect import stripe_kernels
 
     tables = (bands.values, bands.ambient, bands.good, bands.light, bell)
     profiles = (for_table(state.height), for_table(state.background), np.asarray(state.dark_ratio, dtype=np.float32))
-    found = np.empty((len(state.width), 3, 2 * NOISE_SAMPLES), np.float32)
-    counts = stripe_kernels.samples(*tables, *profiles, NOISE_SAMPLES, found)
-    return [tuple(found[b, :, :count]) for b, count in enumerate(counts)]
+    found = np.zeros((len(state.width), 3, 2 * NOISE_SAMPLES), np.float32)
+    return Samples(found, stripe_kernels.samples(*tables, *profiles, NOISE_SAMPLES, found))
 
 
 def _normal_equations(J: Sequence[FloatArray], residual: FloatArray, weight: FloatArray) -> list[FloatArray]:
@@ -407,6 +438,8 @@ def _dark_ratios(bands: Bands, state: _State) -> FloatArray:
 
 def _smooth(bands: Bands, state: _State) -> _Smooth:
     """Smooth curves through the centres, robust against the profiles that show something else."""
+    if pays(0.0, KERNELS):
+        return _smooth_compiled(bands, state)
     sigma = 1.0 / np.sqrt(state.information)
     known = bands.valid & (sigma * bands.cosine < _WORST_SIGMA_PX)
     weight = np.where(known, state.information, 0.0)
@@ -423,8 +456,18 @@ def _smooth(bands: Bands, state: _State) -> _Smooth:
         robust = weight * tukey_weights(standardised / scale)
     kept = np.where(np.abs(standardised) < 4.0 * scale, weight, 0.0)
     narrow = spreads(residual * bands.cosine, kept > 0) < 0.5 * np.maximum(state.width, 1.0)
-    problems = [_TOO_FEW if not e else "" if n else _NOT_NARROW for e, n in zip(enough, narrow, strict=True)]
-    return _Smooth(curves, kept, residual, problems)
+    return _Smooth(curves, kept, residual, np.where(enough, np.where(narrow, 0, 2), 1))
+
+
+def _smooth_compiled(bands: Bands, state: _State) -> _Smooth:
+    """`_smooth` by kernels."""
+    from lidarpose.detect import stripe_profile_kernels
+
+    curves, problems = np.empty((len(state.width), 6)), np.empty(len(state.width), np.int64)
+    kept, residual = np.empty_like(state.centre), np.empty_like(state.centre)
+    profiles = (bands.u, bands.valid, state.centre, state.information, bands.cosine, state.width)
+    stripe_profile_kernels.smooth(*profiles, _WORST_SIGMA_PX, _MIN_POINTS, curves, kept, residual, problems)
+    return _Smooth(Curves(curves[:, :4], curves[:, 4:5], curves[:, 5:6]), kept, residual, problems)
 
 
 def _stated_sigma(offset: FloatArray, sigma: FloatArray) -> NDArray[np.float64]:
@@ -450,6 +493,43 @@ def _stated_sigma(offset: FloatArray, sigma: FloatArray) -> NDArray[np.float64]:
     stated = np.where(spread(scaled) > 1.0, np.hypot(scaled, high), scaled)
     misfit = (np.log(stated) + 0.5 * np.minimum((far / stated) ** 2, 9.0)).sum(axis=1)
     return np.asarray(stated[int(np.argmin(misfit))], dtype=np.float64)
+
+
+def _merged(bands: Bands, smooth: _Smooth, steep: bool, state: _State) -> list[StripeFit | str]:
+    """The points of each band, or why there are none."""
+    if pays(0.0, KERNELS):
+        return _merged_compiled(bands, smooth, steep, state)
+    return [
+        _PROBLEMS[problem] or _points(bands, smooth, steep, state, b)
+        for b, problem in enumerate(smooth.problems.tolist())
+    ]
+
+
+def _merged_compiled(bands: Bands, smooth: _Smooth, steep: bool, state: _State) -> list[StripeFit | str]:
+    """`_merged` by kernels."""
+    from lidarpose.detect import stripe_profile_kernels
+
+    curves = np.concatenate([smooth.curves.coefficients, smooth.curves.middle, smooth.curves.half], axis=1)
+    inflation, points = np.empty(len(curves)), np.empty((len(curves), 5, bands.u.shape[1]))
+    profiles = (bands.u, bands.valid, smooth.weight, smooth.residual, bands.cosine, bands.sine, curves)
+    bounds = ((_BLOCK, _SHORT, _MIN_POINTS), (_WORST_SIGMA_PX, _MODEL_SIGMA_PX), _NOISE_FACTORS[:, 0], _HALVINGS)
+    counts = stripe_profile_kernels.merge(*profiles, *bounds, smooth.problems, inflation, points)
+    found: list[StripeFit | str] = []
+    for b, problem in enumerate(smooth.problems.tolist()):
+        if problem:
+            found.append(_PROBLEMS[problem])
+            continue
+        u, v, cosine, sine, sigma = points[b, :, : counts[b]]
+        of_band = _oriented(u, v, cosine, sine, sigma.copy(), steep)
+        found.append(StripeFit(of_band, float(state.width[b]), float(state.dark_ratio[b]), float(inflation[b])))
+    return found
+
+
+def _oriented(
+    u: FloatArray, v: FloatArray, cosine: FloatArray, sine: FloatArray, sigma: FloatArray, steep: bool
+) -> StripePoints:
+    normals = np.stack([cosine, -sine] if steep else [-sine, cosine], axis=-1)
+    return StripePoints(as_pixels(u, v, steep), normals, sigma)
 
 
 def _points(bands: Bands, smooth: _Smooth, steep: bool, state: _State, b: int) -> StripeFit | str:
@@ -480,8 +560,7 @@ def _points(bands: Bands, smooth: _Smooth, steep: bool, state: _State, b: int) -
     if np.count_nonzero(worth) < max(_MIN_POINTS, len(u) // 2):
         return _TOO_ROUGH
     u, offset, cosine, sine, sigma = u[worth], offset[worth], cosine[worth], sine[worth], sigma[worth]
-    normals = np.stack([cosine, -sine] if steep else [-sine, cosine], axis=-1)
     only = np.arange(len(smooth.problems)) == b
     v = smooth.curves.take(only).at(u[None])[0] + offset
-    points = StripePoints(as_pixels(u, v, steep), normals, sigma)
+    points = _oriented(u, v, cosine, sine, sigma, steep)
     return StripeFit(points, float(state.width[b]), float(state.dark_ratio[b]), inflation)
