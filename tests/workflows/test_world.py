@@ -7,7 +7,7 @@ import pytest
 
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray
-from lidarpose.geometry.se3 import Pose
+from lidarpose.geometry.se3 import Pose, UncertainPose
 from lidarpose.model.calibration import WorldCalibration
 from lidarpose.model.corner_session import CornerSession, MemoryCloud
 from lidarpose.simulate.corner_scene import CornerSceneSpec, CornerTruth, paper_rotation, simulate_corner_session
@@ -50,6 +50,27 @@ def test_each_method_finds_the_pose(simulated: Simulated, method: str, degrees: 
         xi = result.T_world_source.minus(truth.T_world_lidar)
         assert result.covariance is not None
         assert xi @ np.linalg.solve(result.covariance, xi) < 22.5  # 99.9 % of chi-square with six degrees
+
+
+def test_coordinates_of_a_national_grid_give_the_same_answer(simulated: Simulated) -> None:
+    # About an origin thousands of kilometres away a turn is all but a shift: the pose passed for undetermined.
+    session, _, located = simulated
+    grid = np.array([512345.678, 5412345.678, -210.4])
+    world = np.stack([p.corner_world for p in session.places])
+    near = calibrate_world(session, located=located)
+    far = calibrate_world(with_world(session, world + grid))
+    assert far.quality is not None
+    assert far.quality.verdict == "good"
+    back = Pose(np.eye(3), -grid)
+    metres, radians = (back @ far.T_world_source).distance(near.T_world_source)
+    assert metres < 1e-6
+    assert radians < 1e-7
+    assert near.covariance is not None
+    assert far.covariance is not None
+    centre = UncertainPose(near.T_world_source, near.covariance).centre_covariance()
+    shifted = UncertainPose(far.T_world_source, far.covariance).centre_covariance()
+    assert np.allclose(centre, shifted, rtol=0.02, atol=1e-9)
+    assert np.allclose(near.covariance[3:, 3:], far.covariance[3:, 3:], rtol=1e-3, atol=1e-12)
 
 
 def test_half_a_turn_of_yaw_costs_nothing() -> None:

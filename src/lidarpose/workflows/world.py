@@ -187,7 +187,7 @@ def world_run(
     """
     scale_too = session.estimate_scale if estimate_scale is None else estimate_scale
     session = with_scans(replace(session, estimate_scale=scale_too))
-    located = located or locate_target(session, seed=seed, tick=tick)
+    located, origin = _from_their_middle(located or locate_target(session, seed=seed, tick=tick))
     found, crops = located.found, located.crops
     if found.by_edges and method != "joint":
         raise _two_faces()
@@ -197,8 +197,52 @@ def world_run(
             run = _joint_with_all_faces(session, located, scale_too, limits)
         else:
             run = _cornerwise(session, found, crops, method, scale_too, limits, seed)
+    run = _from_the_origin(run, origin)
     recorded = {**(provenance or {}), **run.calibration.provenance}
     return replace(run, calibration=replace(run.calibration, provenance=recorded))
+
+
+def _from_their_middle(located: LocatedTarget) -> tuple[LocatedTarget, FloatArray]:
+    """The world's coordinates counted from the middle of the target's corners, and that middle (3,).
+
+    National grids put a room thousands of kilometres from their origin; about that, a turn and a shift are all but one
+    thing, and the normal equations of a good session are singular to the last digit.
+    """
+    found = located.found
+    origin = np.asarray(found.world.mean(axis=0))
+    match = replace(found.match, T_world_lidar=_shift(-origin) @ found.match.T_world_lidar)
+    return replace(located, found=replace(found, world=found.world - origin, match=match)), origin
+
+
+def _from_the_origin(run: WorldRun, origin: FloatArray) -> WorldRun:
+    """The run with the world's coordinates counted from their own origin again."""
+    back = _shift(origin)
+    calibration = run.calibration
+    covariance, whole = calibration.covariance, calibration.parameter_covariance
+    if covariance is not None:
+        covariance = _about(back, covariance)
+    if whole is not None:
+        whole = _about(back, whole)
+    calibration = replace(
+        calibration,
+        T_world_source=back @ calibration.T_world_source,
+        covariance=covariance,
+        parameter_covariance=whole,
+    )
+    places = tuple(replace(p, corner_world=p.corner_world + origin) for p in run.places)
+    return replace(run, calibration=calibration, places=places)
+
+
+def _shift(by: FloatArray) -> Pose:
+    return Pose(np.eye(3), by)
+
+
+def _about(shift: Pose, covariance: FloatArray) -> FloatArray:
+    """The covariance (n, n) of a pose's left perturbation, and of other parameters behind it, in a shifted frame."""
+    J = np.eye(len(covariance))
+    J[:6, :6] = shift.adjoint()
+    moved = J @ covariance @ J.T
+    return np.asarray(0.5 * (moved + moved.T))
 
 
 def _usable_world(session: CornerSession, found: FoundTarget) -> CornerSession:
