@@ -13,6 +13,22 @@ from numpy.typing import ArrayLike
 from lidarpose.geometry.arrays import FloatArray, as_float_array, unit
 
 
+def unit_form(normal: FloatArray, offset: float) -> tuple[FloatArray, float]:
+    """The same line or plane ``normal . x = offset`` with a unit, read-only normal.
+
+    Raises
+    ------
+    ValueError
+        If the normal is zero.
+    """
+    length = float(np.linalg.norm(normal))
+    if not length > 0.0:
+        raise ValueError("a line or plane needs a normal of non-zero length")
+    normal = normal / length
+    normal.setflags(write=False)
+    return normal, float(offset) / length
+
+
 @dataclass(frozen=True, eq=False)
 class Line2:
     """The line ``normal . x = offset`` in the plane; `normal` (2,) is unit, `offset` in metres."""
@@ -21,14 +37,9 @@ class Line2:
     offset: float
 
     def __post_init__(self) -> None:
-        normal = as_float_array(self.normal, (2,), "normal")
-        length = float(np.linalg.norm(normal))
-        if not length > 0.0:
-            raise ValueError("a line needs a normal of non-zero length")
-        normal = normal / length
-        normal.setflags(write=False)
+        normal, offset = unit_form(as_float_array(self.normal, (2,), "normal"), self.offset)
         object.__setattr__(self, "normal", normal)
-        object.__setattr__(self, "offset", float(self.offset) / length)
+        object.__setattr__(self, "offset", offset)
 
     @property
     def direction(self) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidarpose.geometry.arrays import FloatArray, as_float_array, cross3
-from lidarpose.geometry.lines import Line3
+from lidarpose.geometry.lines import Line3, unit_form
 from lidarpose.geometry.se3 import Pose
 
 
@@ -23,14 +23,9 @@ class Plane:
     offset: float
 
     def __post_init__(self) -> None:
-        normal = as_float_array(self.normal, (3,), "normal")
-        length = float(np.linalg.norm(normal))
-        if not length > 0.0:
-            raise ValueError("a plane needs a normal of non-zero length")
-        normal = normal / length
-        normal.setflags(write=False)
+        normal, offset = unit_form(as_float_array(self.normal, (3,), "normal"), self.offset)
         object.__setattr__(self, "normal", normal)
-        object.__setattr__(self, "offset", float(self.offset) / length)
+        object.__setattr__(self, "offset", offset)
 
     @staticmethod
     def from_pose(T_a_panel: Pose) -> Plane:
