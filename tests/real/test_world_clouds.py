@@ -13,7 +13,8 @@ from lidarpose.model.cloud import Cloud
 from lidarpose.model.corner_result import CornerCandidate
 from lidarpose.model.corner_session import CornerPlace, CrossingBeams, MemoryCloud
 from lidarpose.model.plane_patch import PlanePatch
-from lidarpose.refine.corner_model import FreeCorner, frame_corners
+from lidarpose.refine.frame_corners import PlaceFrames
+from lidarpose.refine.free_corner import FreeCorner
 from lidarpose.storage.clouds import read_cloud
 from lidarpose.storage.corner_session import FileCloud
 from lidarpose.storage.packets import read_packets
@@ -61,7 +62,7 @@ def test_the_corner_of_a_still_carton_repeats_from_frame_to_frame() -> None:
     frames = carton()
     crop, candidate, fit = free_corner(frames)
     faces = select_faces(crop, mask_of(candidate, fit.corner, fit.normals), 6.5 * fit.sigma_m, fit.sigma_m)
-    corners = frame_corners(faces, fit.normals, fit.corner, crop.frames, fit.sigma_m)
+    corners = PlaceFrames.of(faces, fit.normals, fit.corner, crop.frames, fit.sigma_m).corners()
     scatter = np.median(np.abs(corners - np.median(corners, axis=0)), axis=0)
     assert scatter.max() < 0.5e-3
 

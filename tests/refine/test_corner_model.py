@@ -19,12 +19,12 @@ from lidarpose.refine.corner_model import (
     CornerOptions,
     CornerState,
     estimate_world_sigma,
-    fit_corner,
     fit_corner_model,
-    frame_corners,
     place_discrepancies,
     reweighted,
 )
+from lidarpose.refine.frame_corners import PlaceFrames
+from lidarpose.refine.free_corner import fit_corner
 from lidarpose.refine.spot_scatter import spot_scatter, weighed_by_angle
 
 TRUTH = Pose(exp_so3([0.0, 0.5, 0.3]), np.array([0.2, -0.1, 1.5]))
@@ -224,7 +224,7 @@ def test_one_places_corner_and_its_frames() -> None:
     assert np.linalg.norm(corner - true) < 0.005
     assert np.abs(found - normals).max() < 0.01
     assert sigma == pytest.approx(SIGMA_M, rel=0.1)
-    by_frame = frame_corners(places[0].faces, found, corner, 5, sigma)
+    by_frame = PlaceFrames.of(places[0].faces, found, corner, 5, sigma).corners()
     assert np.isnan(by_frame[4]).all()
     assert np.abs(by_frame[:4] - true).max() < 0.02
     # A frame by itself: three free planes through its returns alone.

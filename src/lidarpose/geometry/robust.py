@@ -18,12 +18,32 @@ MAD_TO_SIGMA = 1.4826022185056018
 FEW_VALUES = 600
 
 
-def mad_sigma(values: ArrayLike, *, centred: bool = False) -> float:
-    """Robust standard deviation (median absolute deviation); with `centred`, about zero. NaN if empty."""
+def mad_sigma(values: ArrayLike, *, centred: bool = False, near: float | None = None) -> float:
+    """Robust standard deviation (median absolute deviation); with `centred`, about zero. NaN if empty.
+
+    A guess of it, `near`, finds it sooner.
+    """
     x = np.asarray(values, dtype=np.float64)
     if x.size == 0:
         return float("nan")
-    return MAD_TO_SIGMA * median(np.abs(x if centred else x - median(x)))
+    deviation = np.abs(x if centred else x - median(x))
+    return MAD_TO_SIGMA * (median(deviation) if near is None else median_near(deviation, near / MAD_TO_SIGMA))
+
+
+def median_near(values: FloatArray, guess: float) -> float:
+    """The median of values (N,), found sooner if it lies within a tenth of a guess."""
+    n = values.size
+    if n < FEW_VALUES:
+        return median(values)
+    low, high = 0.9 * guess, 1.1 * guess
+    below = np.count_nonzero(values < low)
+    close = values[(values >= low) & (values < high)]
+    k = n // 2 - below
+    # Else it lies elsewhere, or some value is NaN, which is below nothing and above nothing.
+    if not 0 < k < close.size or below + close.size + np.count_nonzero(values >= high) != n:
+        return median(values)
+    ordered = np.partition(close, k)
+    return float(ordered[k]) if n % 2 else 0.5 * float(ordered[:k].max() + ordered[k])
 
 
 def median(values: FloatArray) -> float:

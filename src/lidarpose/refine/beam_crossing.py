@@ -15,7 +15,8 @@ import numpy as np
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.rings import tangent_of_elevation
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
-from lidarpose.refine.corner_model import CornerFit, face_jacobians, weighted_rows
+from lidarpose.refine.corner_model import CornerFit, face_jacobians
+from lidarpose.refine.face_systems import weighted_rows
 from lidarpose.refine.ring_offsets import RingEquations, Rings, ring_equations
 
 # So many standard deviations are no chance; what edges and mixed pixels do to faces passes for some millimetres.

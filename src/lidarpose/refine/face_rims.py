@@ -18,7 +18,7 @@ import numpy as np
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, unit
 from lidarpose.geometry.threads import each
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
-from lidarpose.refine.corner_model import tangents
+from lidarpose.refine.face_systems import tangents
 
 # A side's returns are tested this far inwards, or for this share of the face where that is less.
 STRIP_M, STRIP_SHARE = 0.04, 0.2

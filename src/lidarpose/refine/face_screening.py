@@ -14,7 +14,8 @@ import numpy as np
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.robust import median
 from lidarpose.model.corner_result import FaceReturns
-from lidarpose.refine.corner_model import direction_grid, face_residuals, face_rows
+from lidarpose.refine.direction_cells import direction_grid
+from lidarpose.refine.face_systems import face_residuals, face_rows
 
 SPOT_RAD = np.radians(1.2)
 # Beams of a multi-beam LiDAR are off by about one sigma each, all frames alike: that is no reason to drop them.

@@ -18,14 +18,8 @@ import numpy as np
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.rings import ring_numbers
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
-from lidarpose.refine.corner_model import (
-    MIN_RETURNS,
-    CornerFit,
-    FaceSystem,
-    face_jacobians,
-    joint_information,
-    weighted_rows,
-)
+from lidarpose.refine.corner_model import CornerFit, face_jacobians, joint_information
+from lidarpose.refine.face_systems import MIN_RETURNS, FaceSystem, weighted_rows
 
 # Twice the gain in log likelihood from which offsets are believed in: chance reaches it once in a thousand times.
 CONVINCING_GAIN = 9.0
@@ -138,7 +132,7 @@ def ring_equations(fit: CornerFit, places: Sequence[CornerPlaceFaces], rings: Ri
     for (i, j), ring in rings.numbers.items():
         residual, rows, weight = weighted_rows(places[i].faces[j], fit.state.normals[j], corners[i], fit.range_sigma_m)
         weighted = rows * weight
-        systems[i, j] = FaceSystem(weighted @ rows.T, weighted @ residual, len(ring))
+        systems[i, j] = FaceSystem(weighted @ rows.T, weighted @ residual)
         crossed[i, j] = np.stack([np.bincount(ring, row, count) for row in weighted])
         own += np.bincount(ring, weight, count)
         ring_pull += np.bincount(ring, weight * residual, count)

@@ -15,7 +15,9 @@ import numpy as np
 
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
-from lidarpose.refine.corner_model import CornerFit, direction_cells, face_jacobians, face_residuals, reweighted
+from lidarpose.refine.corner_model import CornerFit, face_jacobians, reweighted
+from lidarpose.refine.direction_cells import direction_cells
+from lidarpose.refine.face_systems import face_residuals
 
 CELL_RAD = np.radians(1.5)
 # Beams that are wider than this in standard deviations are no beams, and narrower ones do nothing.

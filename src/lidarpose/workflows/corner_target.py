@@ -20,8 +20,8 @@ from lidarpose.geometry.threads import each
 from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import NEAR_RADIUS_M, CornerPlace, CornerSession, look_at_points
 from lidarpose.model.observation import LeftOut
-from lidarpose.refine.corner_model import FreeCorner, fit_corner
 from lidarpose.refine.face_screening import without_foreign_spots
+from lidarpose.refine.free_corner import FreeCorner, fit_corner
 from lidarpose.solve.corner_matching import (
     SAME_ORIENTATION_RAD,
     TOLERANCE_M,

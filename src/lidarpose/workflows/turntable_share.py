@@ -15,7 +15,8 @@ import numpy as np
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import CornerSession
-from lidarpose.refine.corner_model import CornerFit, face_jacobians, joint_information, weighted_rows
+from lidarpose.refine.corner_model import CornerFit, face_jacobians, joint_information
+from lidarpose.refine.face_systems import weighted_rows
 from lidarpose.workflows.recorded_corners import ScannedCloud
 
 # Shifts are smooth over a face.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -70,3 +71,14 @@ def _has_returns(place: CornerPlaceFaces) -> BoolArray:
 def _points(returns: FaceReturns) -> FloatArray:
     step = max(1, len(returns) // MOST_POINTS_A_FACE)
     return np.asarray(returns.directions[::step] * returns.range_m[::step, None])
+
+
+def provenance(session: CornerSession, method: str) -> dict[str, Any]:
+    """What of the session and the method goes into the calibration's record."""
+    frames = sum(len(p.clouds) for p in session.places)
+    return {
+        "session": session.name,
+        "method": method,
+        "places": len(session.places),
+        "frames": frames,
+    }
