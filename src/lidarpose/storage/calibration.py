@@ -6,12 +6,11 @@ A reader needs `format`, `kind` and `transforms` alone, as files of other progra
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray
@@ -20,61 +19,15 @@ from lidarpose.model.beam_correction import BeamCorrection
 from lidarpose.model.calibration import Calibration, Quality, TurntableCalibration, WorldCalibration
 from lidarpose.model.turntable import PARAMETER_NAMES, TurntableMotion
 from lidarpose.storage.atomic import write_text
-from lidarpose.storage.documents import check_format, parse, read_json
+from lidarpose.storage.documents import check_format, read_json
+from lidarpose.storage.sections import Within, plainly
+
+if TYPE_CHECKING:
+    from lidarpose.storage.calibration_schema import CalibrationFile, TransformEntry
 
 CALIBRATION_FORMAT = "lidarpose/calibration@1"
 
-_Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
-_Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
-_Row6 = Annotated[list[float], Field(min_length=6, max_length=6)]
-
-
-class _Lenient(BaseModel):
-    # Other programs may add keys of their own; what we know must be right.
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False, frozen=True)
-
-
-class _TransformEntry(_Lenient):
-    parent: str
-    child: str
-    translation_m: _Row3 | None = None
-    quaternion_xyzw: _Row4 | None = None
-    matrix: Annotated[list[_Row4], Field(min_length=4, max_length=4)] | None = None
-    covariance: Annotated[list[_Row6], Field(min_length=6, max_length=6)] | None = None
-
-
-class _ParametersEntry(_Lenient):
-    names: list[str]
-    covariance: list[list[float]]
-
-
-class _ReadingsEntry(_Lenient):
-    scale: Annotated[float, Field(ge=0.01, le=100.0)]
-    origin_rad: Annotated[float, Field(ge=-1e4, le=1e4)]
-
-
-class _BeamsEntry(_Lenient):
-    angle_scale: Annotated[float, Field(ge=0.5, le=2.0)] = 1.0
-    range_scale: Annotated[float, Field(ge=0.5, le=2.0)] = 1.0
-    range_offset_m: Annotated[float, Field(ge=-10.0, le=10.0)] = 0.0
-
-
-class _QualityEntry(_Lenient):
-    model_config = ConfigDict(extra="allow", frozen=True)
-    verdict: Literal["good", "doubtful", "rejected"]
-    reasons: list[str] = []
-
-
-class _CalibrationFile(_Lenient):
-    format: Literal["lidarpose/calibration@1"]
-    kind: Literal["turntable", "world"]
-    transforms: Annotated[list[_TransformEntry], Field(min_length=1)]
-    scale: Annotated[float, Field(gt=0.0)] = 1.0
-    readings: _ReadingsEntry | None = None
-    beams: _BeamsEntry | None = None
-    parameters: _ParametersEntry | None = None
-    quality: _QualityEntry | None = None
-    provenance: dict[str, Any] = {}
+_Row4 = Annotated[list[float], Within(min_length=4, max_length=4)]
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
@@ -150,7 +103,10 @@ def read_calibration(path: Path) -> Calibration:
         If the file is missing or no calibration, a transform is missing, contradicts itself or is no rigid motion, or
         a covariance is not symmetric and positive.
     """
-    file = parse(path, _CalibrationFile, check_format(path, read_json(path), CALIBRATION_FORMAT))
+    from lidarpose.storage.calibration_schema import CalibrationFile
+    from lidarpose.storage.schemas import parse
+
+    file = parse(path, CalibrationFile, check_format(path, read_json(path), CALIBRATION_FORMAT))
     quality = None
     if file.quality is not None:
         figures = dict(file.quality.model_extra or {})
@@ -176,7 +132,7 @@ def read_world_calibration(path: Path) -> WorldCalibration:
     return calibration
 
 
-def _turntable(path: Path, file: _CalibrationFile, quality: Quality | None) -> TurntableCalibration:
+def _turntable(path: Path, file: CalibrationFile, quality: Quality | None) -> TurntableCalibration:
     table, table_covariance = _transform(path, file, "camera", "turntable")
     lidar, lidar_covariance = _transform(path, file, "turntable", "lidar")
     motion = TurntableMotion.from_any_frame(table, lidar)
@@ -221,7 +177,7 @@ def _motion_difference(motion: TurntableMotion, nominal: TurntableMotion) -> Flo
     return np.concatenate([table, [motion.radius_m - nominal.radius_m], turn])
 
 
-def _world(path: Path, file: _CalibrationFile, quality: Quality | None) -> WorldCalibration:
+def _world(path: Path, file: CalibrationFile, quality: Quality | None) -> WorldCalibration:
     source: Literal["lidar", "camera"] = "lidar"
     if not any(entry.child == "lidar" for entry in file.transforms):
         source = "camera"
@@ -230,7 +186,7 @@ def _world(path: Path, file: _CalibrationFile, quality: Quality | None) -> World
     return WorldCalibration(pose, source, file.scale, covariance, names, parameter_covariance, quality, file.provenance)
 
 
-def _transform(path: Path, file: _CalibrationFile, parent: str, child: str) -> tuple[Pose, FloatArray | None]:
+def _transform(path: Path, file: CalibrationFile, parent: str, child: str) -> tuple[Pose, FloatArray | None]:
     entries = [(k, e) for k, e in enumerate(file.transforms) if (e.parent, e.child) == (parent, child)]
     if len(entries) != 1:
         found = ", ".join(f"{e.parent} <- {e.child}" for e in file.transforms)
@@ -254,7 +210,7 @@ def transform_from(path: Path, entries: list[Any], parent: str, child: str) -> P
         If an entry is no transform, or no rigid motion.
     """
     for index, document in enumerate(entries):
-        entry = parse(path, _TransformEntry, document)
+        entry = plainly(_PlainTransform, document) or _checked_transform(path, document)
         if (entry.parent, entry.child) == (parent, child):
             try:
                 return _pose(entry)
@@ -264,7 +220,25 @@ def transform_from(path: Path, entries: list[Any], parent: str, child: str) -> P
     return None
 
 
-def _pose(entry: _TransformEntry) -> Pose:
+@dataclass(frozen=True)
+class _PlainTransform:
+    """An entry as this package writes it."""
+
+    parent: str
+    child: str
+    translation_m: Annotated[list[float], Within(min_length=3, max_length=3)]
+    quaternion_xyzw: _Row4
+    matrix: Annotated[list[_Row4], Within(min_length=4, max_length=4)]
+
+
+def _checked_transform(path: Path, document: Any) -> TransformEntry:
+    from lidarpose.storage.calibration_schema import TransformEntry
+    from lidarpose.storage.schemas import parse
+
+    return parse(path, TransformEntry, document)
+
+
+def _pose(entry: TransformEntry | _PlainTransform) -> Pose:
     from_matrix = None if entry.matrix is None else Pose.from_matrix(entry.matrix)
     if entry.quaternion_xyzw is None or entry.translation_m is None:
         if from_matrix is None:
@@ -278,7 +252,7 @@ def _pose(entry: _TransformEntry) -> Pose:
     return pose if from_matrix is None else from_matrix
 
 
-def _parameters(path: Path, file: _CalibrationFile) -> tuple[tuple[str, ...], FloatArray | None]:
+def _parameters(path: Path, file: CalibrationFile) -> tuple[tuple[str, ...], FloatArray | None]:
     if file.parameters is None:
         return (), None
     names, covariance = tuple(file.parameters.names), file.parameters.covariance

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray
@@ -21,11 +20,12 @@ from lidarpose.model.recording import SweepRecording
 from lidarpose.model.scan import LidarSpec
 from lidarpose.storage.atomic import replacing_folder, restore_folder, write_text
 from lidarpose.storage.calibration import read_calibration, read_turntable_calibration
-from lidarpose.storage.documents import Schema, check_format, parse, read_toml, shown
+from lidarpose.storage.documents import check_format, read_toml, shown
 from lidarpose.storage.limits import find_files
 from lidarpose.storage.provenance import provenance
 from lidarpose.storage.recording import recording_files
 from lidarpose.storage.recording_head import HEAD, is_recording
+from lidarpose.storage.sections import Within, read_sections
 from lidarpose.storage.session import CORNER_SESSION_FORMAT, LidarSection, inside
 from lidarpose.storage.session_folder import check_free
 from lidarpose.storage.tables import TextTable, read_text_table
@@ -43,6 +43,7 @@ _LARGEST_CROSSING_M = 0.2
 _NEAR = ("near_x_m", "near_y_m", "near_z_m")
 
 
+@dataclass(frozen=True)
 class _LidarSection(LidarSection):
     """[lidar] of a corner session."""
 
@@ -52,14 +53,15 @@ class _LidarSection(LidarSection):
         return replace(super().spec(), beam_crossing_m=self.beam_crossing_m)
 
 
-class _SessionFile(Schema):
+@dataclass(frozen=True)
+class _SessionFile:
     format: Literal["lidarpose/corner-session@1"]
     positions: str
-    world_sigma_m: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    world_sigma_m: Annotated[float, Within(ge=0.0, le=1.0)] | None = None
     estimate_scale: bool = False
-    cloud_frame: Literal["lidar", "camera"] = "lidar"
+    cloud_frame: Literal["lidar", "camera"] | None = None
     turntable_calibration: str | None = None
-    lidar: _LidarSection = _LidarSection()
+    lidar: _LidarSection = field(default_factory=_LidarSection)
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ def read_corner_session(folder: Path) -> CornerSession:
     if not folder.is_dir():
         problem = "is missing" if not folder.exists() else "is not a folder"
         raise InputError(folder, problem, expected="a session's folder")
-    document = parse(file, _SessionFile, check_format(file, read_toml(file), CORNER_SESSION_FORMAT))
+    document = read_sections(file, _SessionFile, check_format(file, read_toml(file), CORNER_SESSION_FORMAT))
     places = _read_places(folder, inside(folder, document.positions, file, "positions"))
     cloud_frame, turntable = _recorded(folder, file, document, places)
     crossing_m = document.lidar.beam_crossing_m
@@ -152,12 +154,12 @@ def _recorded(
 ) -> tuple[CloudFrame, TurntableCalibration | None]:
     """The clouds' frame, the camera's where any is a recording, and the calibration that makes clouds of those."""
     recorded = any(isinstance(source, FileRecording) for place in places for source in place.clouds)
-    if recorded and document.cloud_frame != "camera" and "cloud_frame" in document.model_fields_set:
+    if recorded and document.cloud_frame == "lidar":
         problem = f'is "{document.cloud_frame}", but places hold sweep recordings'
         raise InputError(
             file, problem, field="cloud_frame", expected='"camera", where the calibration puts their points'
         )
-    frame: CloudFrame = "camera" if recorded else document.cloud_frame
+    frame: CloudFrame = "camera" if recorded else document.cloud_frame or "lidar"
     if document.turntable_calibration is None:
         return frame, None
     path = inside(folder, document.turntable_calibration, file, "turntable_calibration")
@@ -297,7 +299,7 @@ def _session_toml(session: CornerSession) -> str:
 
 def session_provenance(folder: Path, session: CornerSession, options: Mapping[str, Any]) -> dict[str, Any]:
     """A record of a run on a session: hashes of its description; of the clouds, which are large, number and size."""
-    document = parse(folder / "session.toml", _SessionFile, read_toml(folder / "session.toml"))
+    document = read_sections(folder / "session.toml", _SessionFile, read_toml(folder / "session.toml"))
     record = provenance("calibrate", folder, [folder / "session.toml", folder / document.positions], options)
     clouds = [source for place in session.places for source in place.clouds]
     files = [source.source if isinstance(source, CrossingBeams) else source for source in clouds]

@@ -1,4 +1,4 @@
-"""TOML, YAML and JSON documents: read within bounds, checked against a schema, with errors that name file and key."""
+"""TOML, YAML and JSON documents, read within bounds, with errors that name file and key."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import reprlib
 import tomllib
 from functools import cache
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
-
-from pydantic import BaseModel, ConfigDict, ValidationError
+from typing import Any, NoReturn
 
 from lidarpose.errors import InputError
 
@@ -21,16 +19,6 @@ MAX_YAML_BYTES = 2**16
 MAX_TOML_BYTES = 2**16
 MAX_XML_BYTES = 2**18
 _MAX_DOTS = 256
-
-
-class Schema(BaseModel):
-    """Base of the file schemas: unknown keys, NaN and infinity are errors; numbers are numbers, not text."""
-
-    # Validators are built at first use: a command needs few of them.
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True, strict=True, defer_build=True)
-
-
-S = TypeVar("S", bound=BaseModel)
 
 
 def read_text(path: Path, what: str, limit: int = MAX_DOCUMENT_BYTES) -> str:
@@ -175,18 +163,6 @@ def check_format(path: Path, document: Any, expected: str) -> dict[str, Any]:
         remedy = f"This version of lidarpose reads {name} version {version} only." if newer else None
         raise InputError(path, problem, field="format", expected=f'"{expected}"', remedy=remedy)
     return document
-
-
-def parse(path: Path, schema: type[S], document: Any) -> S:
-    """Check a document against its schema; the first violation becomes an InputError naming the key."""
-    try:
-        return schema.model_validate(document)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = ".".join(str(part) for part in first["loc"]) or "the document"
-        found = "" if first["type"] in ("missing", "extra_forbidden") else f", found {shown(first['input'])}"
-        message = {"missing": "is missing", "extra_forbidden": "is not a known key"}.get(first["type"], first["msg"])
-        raise InputError(path, f"{message}{found}", field=field) from None
 
 
 def shown(value: Any) -> str:

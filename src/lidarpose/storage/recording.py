@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import mmap
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,9 +19,10 @@ from lidarpose.model.scan import LidarSpec
 from lidarpose.model.turntable import PARAMETER_NAMES, TurntableMotion
 from lidarpose.storage.atomic import replacing_folder, restore_folder, write_text
 from lidarpose.storage.calibration import transform_entry, write_calibration
-from lidarpose.storage.documents import Schema, check_format, parse, read_toml
+from lidarpose.storage.documents import check_format, read_toml
 from lidarpose.storage.npy_header import read_npy_header
 from lidarpose.storage.recording_head import HEAD
+from lidarpose.storage.sections import read_sections
 from lidarpose.storage.session import LidarSection
 from lidarpose.storage.session_folder import check_free
 from lidarpose.storage.truth import truth_path
@@ -35,9 +37,10 @@ _LARGEST_ANGLE_DEG = 3.6e5
 _LARGEST_RANGE_M = 2000.0
 
 
-class _HeadFile(Schema):
+@dataclass(frozen=True)
+class _HeadFile:
     format: Literal["lidarpose/sweep-recording@1"]
-    lidar: LidarSection = LidarSection()
+    lidar: LidarSection = field(default_factory=LidarSection)
 
 
 def recording_files(folder: Path) -> list[Path]:
@@ -171,7 +174,7 @@ def _head_text(lidar: LidarSpec) -> str:
 
 def _read_head(path: Path) -> LidarSpec:
     document = check_format(path, read_toml(path), FORMAT)
-    return parse(path, _HeadFile, document).lidar.spec()
+    return read_sections(path, _HeadFile, document).lidar.spec()
 
 
 def _map_array(path: Path, *, required: bool) -> RealArray | None:

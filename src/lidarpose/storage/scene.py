@@ -10,7 +10,8 @@ from pydantic import Field
 
 from lidarpose.errors import InputError
 from lidarpose.geometry.se3 import Pose, exp_so3
-from lidarpose.storage.documents import Schema, check_format, parse, read_toml
+from lidarpose.storage.documents import check_format, read_toml
+from lidarpose.storage.schemas import Schema, parse
 
 SCENE_FORMAT = "lidarpose/scene@1"
 

@@ -7,12 +7,11 @@ plausible, rows are in the order in which a turntable turns.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
 
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray, IntArray
@@ -23,9 +22,10 @@ from lidarpose.model.sense import Sense, StatedSense
 from lidarpose.model.session import DEFAULT_PLACEMENT, TurntablePlace, TurntableSession
 from lidarpose.model.targets import Panel
 from lidarpose.storage.camera_files import read_camera
-from lidarpose.storage.documents import Schema, check_format, parse, read_toml, shown
+from lidarpose.storage.documents import check_format, read_toml, shown
 from lidarpose.storage.images import FileImage
 from lidarpose.storage.limits import find_files, is_file
+from lidarpose.storage.sections import Within, read_sections
 from lidarpose.storage.tables import TextTable, read_number_table, read_text_table
 
 SESSION_FORMAT = "lidarpose/turntable-session@1"
@@ -35,39 +35,44 @@ MAX_PLACES = 10_000
 MAX_RANGE_M = 500.0
 
 
-class LidarSection(Schema):
+@dataclass(frozen=True)
+class LidarSection:
     """The optional [lidar] table of sessions and recordings."""
 
     model: str | None = None
-    range_sigma_m: Annotated[float, Field(gt=0.0, le=0.5)] | None = None
+    range_sigma_m: Annotated[float, Within(gt=0.0, le=0.5)] | None = None
 
     def spec(self) -> LidarSpec:
         return LidarSpec(self.model, self.range_sigma_m)
 
 
-class _PanelSection(Schema):
-    columns: Annotated[int, Field(ge=3, le=500)]
-    rows: Annotated[int, Field(ge=3, le=500)]
-    square_m: Annotated[float, Field(gt=0.0, le=1.0)]
+@dataclass(frozen=True)
+class _PanelSection:
+    columns: Annotated[int, Within(ge=3, le=500)]
+    rows: Annotated[int, Within(ge=3, le=500)]
+    square_m: Annotated[float, Within(gt=0.0, le=1.0)]
 
 
-class _BoardSection(Schema):
+@dataclass(frozen=True)
+class _BoardSection:
     images: str
-    panels: Annotated[list[_PanelSection], Field(min_length=1, max_length=2)]
+    panels: Annotated[list[_PanelSection], Within(min_length=1, max_length=2)]
 
 
-class _TurningSection(Schema):
+@dataclass(frozen=True)
+class _TurningSection:
     beams: Sense | None = None
     table: Sense | None = None
 
 
-class _SessionFile(Schema):
+@dataclass(frozen=True)
+class _SessionFile:
     format: Literal["lidarpose/turntable-session@1"]
     camera: str
     positions: str
     board: _BoardSection
-    lidar: LidarSection = LidarSection()
-    turning: _TurningSection = _TurningSection()
+    lidar: LidarSection = field(default_factory=LidarSection)
+    turning: _TurningSection = field(default_factory=_TurningSection)
 
 
 @dataclass(frozen=True)
@@ -108,7 +113,7 @@ def read_turntable_session(folder: Path, *, any_order: bool = False) -> Turntabl
         raise InputError(
             folder, "is missing" if not folder.exists() else "is not a folder", expected="a session's folder"
         )
-    document = parse(file, _SessionFile, check_format(file, read_toml(file), SESSION_FORMAT))
+    document = read_sections(file, _SessionFile, check_format(file, read_toml(file), SESSION_FORMAT))
     panels = tuple(_panel(file, k, section) for k, section in enumerate(document.board.panels))
     camera = read_camera(inside(folder, document.camera, file, "camera"))
     places = _read_positions(folder, inside(folder, document.positions, file, "positions"), camera, any_order)
@@ -132,7 +137,7 @@ def session_format(folder: Path) -> str:
 
 def session_files(folder: Path, session: TurntableSession) -> list[Path]:
     """All files that a session read from a folder stands on."""
-    document = parse(folder / "session.toml", _SessionFile, read_toml(folder / "session.toml"))
+    document = read_sections(folder / "session.toml", _SessionFile, read_toml(folder / "session.toml"))
     files = [folder / "session.toml", folder / document.camera, folder / document.positions]
     sources = [source for shots in session.board_images.values() for source in shots]
     sources += [place.stripe_image for place in session.places if place.stripe_image is not None]
