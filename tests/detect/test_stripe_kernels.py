@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
 import pytest
 
+from lidarpose.detect.albedo import measure_albedo
 from lidarpose.detect.chessboard import find_panels
 from lidarpose.detect.laser_stripe import StripeDetection, StripeFinder
 from lidarpose.detect.stripe_noise import Samples, learn_noise
-from lidarpose.detect.stripe_search import parabola, reduce_image
+from lidarpose.detect.stripe_search import PanelView, find_line, parabola, reduce_image
 from lidarpose.geometry import compiled
 
 pytestmark = pytest.mark.skipif(not compiled.installed(), reason="numba is not installed")
@@ -90,7 +93,7 @@ def test_faint_stripes_are_given_up_alike(two_panels, shots, factor: float) -> N
 
 @pytest.mark.parametrize("factor", [2, 3, 4])
 def test_means_of_blocks(factor: int) -> None:
-    from lidarpose.detect.stripe_kernels import block_means
+    from lidarpose.detect.stripe_search_kernels import block_means
 
     image = np.random.default_rng(factor).integers(0, 256, (97, 131), dtype=np.uint8)
     low, high = (5, 3), (5 + 9 * factor, 3 + 7 * factor)
@@ -137,3 +140,27 @@ def test_selecting_is_as_sorting(count: int) -> None:
     for values in (rng.random(count), rng.integers(0, 5, count).astype(float), np.arange(count, dtype=float)):
         for k in {0, count // 3, count - 1}:
             assert select(values.copy(), count, k) == np.sort(values)[k]
+
+
+def test_lines_in_reduced_images_are_the_very_same(two_panels, shots, images) -> None:
+    """One line or two, of any direction, near the panel's ends, in light of which the board shows more or less."""
+    board = find_panels(shots, [board.panel for board in two_panels.boards])
+    bright = np.asarray(shots[0], np.float32)
+    views = [PanelView.make(measure_albedo(grid_map, bright), bright) for grid_map in board.maps]
+    rng = np.random.default_rng(5)
+    v, u = np.indices(bright.shape)
+    seen = list(images)
+    for k in range(24):
+        (x, y), a = rng.uniform(0.1, 0.9, 2) * [two_panels.width, two_panels.height], rng.uniform(0.0, np.pi)
+        image = 0.3 * (k % 3) * bright
+        for offset, width in ((0.0, 2.0), (rng.uniform(-120.0, 120.0), rng.uniform(1.5, 12.0)))[: 1 + k % 2]:
+            image = image + 90.0 * np.exp(-0.5 * (((u - x) * np.sin(a) - (v - y) * np.cos(a) - offset) / width) ** 2)
+        seen.append(two_panels.noisy(np.roll(image, 70, axis=1) if k % 8 == 5 else image, rng))
+    answers = []
+    for way in (True, False):
+        with compiled.forced(way):
+            found = [find_line(view, image) for image in seen for view in views]
+        answers.append([line if isinstance(line, str) else astuple(line) for line in found])
+    assert answers[0] == answers[1]
+    assert len({answer for answer in answers[0] if isinstance(answer, str)}) >= 3
+    assert sum(not isinstance(answer, str) for answer in answers[0]) >= 20

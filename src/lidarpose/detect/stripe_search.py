@@ -26,6 +26,11 @@ _VOTE = 256
 _AMBIGUOUS = 0.5
 # A stripe, saturated or not, is narrower than twice this many reduced pixels.
 _RIDGE_REACH = 4
+_NO_LINE = "no stripe on the panel: nothing stands out in a line"
+_ELSEWHERE = "the board is not where the bright images show it: it or the camera was moved"
+_TOO_SHORT = "no stripe on the panel: the only bright line is too short"
+# Lines of fewer reduced pixels than this share of the panel are too short.
+_LEAST_LENGTH = 0.15
 _TWO_LINES = "two lines of light on the panel, and nothing tells which one is the laser's"
 # A lit stripe image shows the board elsewhere if it correlates with the bright image by less than this.
 _LEAST_CORRELATION = 0.5
@@ -116,9 +121,9 @@ class PanelView:
     def reduced(self, image: GrayImage) -> FloatArray:
         """The panel's part of an image, reduced (float32)."""
         if self.factor > 1 and image.dtype == np.uint8 and pays(0.0, KERNELS):
-            from lidarpose.detect import stripe_kernels
+            from lidarpose.detect import stripe_search_kernels
 
-            return np.asarray(stripe_kernels.block_means(image, self.low, self.high, self.factor))
+            return np.asarray(stripe_search_kernels.block_means(image, self.low, self.high, self.factor))
         return reduce_image(image[self.low[1] : self.high[1], self.low[0] : self.high[0]], self.factor)
 
     @cached_property
@@ -284,17 +289,19 @@ def has_line(view: PanelView) -> bool:
 
 
 def _find_in_reduced(view: PanelView, small: FloatArray, template: Template, least: float = 1.5) -> CoarseLine | str:
+    if pays(0.0, KERNELS):
+        return _find_compiled(view, small, template, least)
     share, offset = _ambient(view, small, template)
     if _is_elsewhere(view, small, template):
-        return "the board is not where the bright images show it: it or the camera was moved"
+        return _ELSEWHERE
     rest, ridges = _rest_and_ridges(view, small, template.image, share, offset)
     threshold = max(6.0 * _noise(view, ridges), least)
     first = _best_line(ridges, threshold)
     if first is None:
-        return "no stripe on the panel: nothing stands out in a line"
+        return _NO_LINE
     line, support, length = first
-    if length < 0.15 * min(small.shape):
-        return "no stripe on the panel: the only bright line is too short"
+    if length < _LEAST_LENGTH * min(small.shape):
+        return _TOO_SHORT
     for ridge, steep in zip(ridges, (False, True), strict=True):
         _erase(ridge, line, steep)
     second = _best_line(ridges, max(threshold, 0.3 * line.level))
@@ -304,6 +311,23 @@ def _find_in_reduced(view: PanelView, small: FloatArray, template: Template, lea
             return _TWO_LINES
         line = chosen
     return _to_image(line, view, share)
+
+
+def _find_compiled(view: PanelView, small: FloatArray, template: Template, least: float) -> CoarseLine | str:
+    """`_find_in_reduced` by kernels."""
+    from lidarpose.detect import stripe_search_kernels
+
+    rest, found = np.empty_like(small), np.empty((3, 8))
+    squares = (view.light, view.dark, view.inner, template.shape)
+    levels = (template.light, template.dark, template.low, template.high)
+    bounds = (_LIT_SHARE, _LEAST_CORRELATION, _AMBIGUOUS, _LEAST_LENGTH)
+    parts = (template.image, view.small_mask, *squares, levels, _DRAWS, _VOTE, _RIDGE_REACH, bounds)
+    answer = stripe_search_kernels.find_line(small, *parts, least, rest, found)
+    if answer < 3:
+        return (_NO_LINE, _ELSEWHERE, _TOO_SHORT)[answer]
+    lines = [_SmallLine(k[7] > 0.0, k[2], k[3], k[0], k[1], k[4]) for k in found[: answer - 2].tolist()]
+    chosen = lines[0] if len(lines) == 1 else _sharper(rest, *lines)
+    return _TWO_LINES if chosen is None else _to_image(chosen, view, float(found[2, 0]))
 
 
 def _sharper(rest: FloatArray, a: _SmallLine, b: _SmallLine) -> _SmallLine | None:
@@ -386,13 +410,6 @@ def _rest_and_ridges(
     """What the bright image (`template`) does not explain, zero off the panel; its ridges along x and along y."""
     if len(view.light) == 0 or len(view.dark) == 0:
         rest = np.zeros_like(small)
-    elif pays(0.0, KERNELS):
-        from lidarpose.detect import stripe_kernels
-
-        rest, along, across = np.empty_like(small), np.empty_like(small), np.empty(small.shape[::-1], np.float32)
-        parts = (np.float32(share), np.float32(offset), _RIDGE_REACH)
-        stripe_kernels.rest_and_ridges(small, template, view.small_mask, *parts, rest, along, across)
-        return rest, (along, across)
     else:
         rest = np.asarray(small - np.float32(share) * template)
         rest -= np.float32(offset)
@@ -426,17 +443,6 @@ _Line = tuple[float, float, float, float, float, float, float]
 
 def _line_in(ridge: FloatArray, threshold: float) -> _Line | None:
     """The line through the columns' maxima above a threshold."""
-    if pays(0.0, KERNELS):
-        from lidarpose.detect import stripe_kernels
-
-        peak, height = np.empty(ridge.shape[1], np.int64), np.empty(ridge.shape[1], np.float32)
-        stripe_kernels.peaks(ridge, peak, height)
-        found = np.empty(7)
-        least = np.asarray(threshold, dtype=np.float32)[()]
-        if not stripe_kernels.consensus(peak, height, least, _DRAWS, len(ridge), _VOTE, found):
-            return None
-        slope, intercept, start, end, level, support, length = found.tolist()
-        return slope, intercept, start, end, level, support, length
     peak = np.argmax(ridge, axis=0)
     height = ridge[peak, np.arange(ridge.shape[1])]
     x = np.flatnonzero(height > threshold)
@@ -498,11 +504,6 @@ def _erase(ridge: FloatArray, line: _SmallLine, steep: bool) -> None:
     field = ridge if steep == line.steep else ridge.T
     x = np.arange(field.shape[1])
     middle = np.rint(line.intercept + line.slope * x).astype(np.intp)
-    if pays(0.0, KERNELS):
-        from lidarpose.detect import stripe_kernels
-
-        stripe_kernels.erase(field, middle, reach)
-        return
     y = np.clip(middle + np.arange(-reach, reach + 1)[:, None], 0, field.shape[0] - 1)
     field[y, x] = 0.0
 
