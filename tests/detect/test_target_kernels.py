@@ -87,11 +87,13 @@ def test_the_same_points_are_in_a_box(dtype: type[np.floating[Any]], columns: in
     assert len(border) == 0
 
 
-def test_a_calibration_is_the_same_to_the_bit() -> None:
+def test_a_calibration_is_the_same_but_for_rounding() -> None:
     session, _ = simulate_corner_session(CornerSceneSpec(pose="1", frames=2, places=4, seed=4))
     found = []
     for way in (False, True):
         with compiled.forced(way):
             found.append(calibrate_world(session))
-    np.testing.assert_array_equal(found[0].T_world_source.matrix, found[1].T_world_source.matrix)
-    np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
+    np.testing.assert_allclose(found[0].T_world_source.matrix, found[1].T_world_source.matrix, atol=1e-12)
+    assert found[0].covariance is not None
+    assert found[1].covariance is not None
+    np.testing.assert_allclose(found[0].covariance, found[1].covariance, rtol=1e-8, atol=1e-16)
