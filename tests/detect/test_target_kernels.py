@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from lidarpose.detect.crop import inside_box
+from lidarpose.detect.moved_points import moved_points
 from lidarpose.detect.trihedral_corner import FaceMask
 from lidarpose.geometry import compiled
 from lidarpose.geometry.arrays import FloatArray, unit
 from lidarpose.geometry.planes import Plane
 from lidarpose.geometry.se3 import Pose
-from lidarpose.simulate.corner_scene import CornerSceneSpec, simulate_corner_session
+from lidarpose.simulate.corner_scene import CornerSceneSpec, TargetKind, simulate_corner_session
+from lidarpose.workflows.corner_target import find_target
 from lidarpose.workflows.world import calibrate_world
 
 pytestmark = pytest.mark.skipif(not compiled.installed(), reason="numba is not installed")
@@ -85,6 +87,47 @@ def test_the_same_points_are_in_a_box(dtype: type[np.floating[Any]], columns: in
     with compiled.forced(True):
         border = inside_box(points[5:7], np.array([0.5, 1.0, -2.0]), np.array([1.5, 2.0, -1.0]))
     assert len(border) == 0
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_same_points_have_moved(dtype: type[np.floating[Any]]) -> None:
+    rng = np.random.default_rng(7)
+    room = rng.uniform([-20.0, -5.0, -1.0], [20.0, 5.0, -0.8], (30_000, 3))
+    frames = []
+    for k in range(3):
+        apart = rng.normal([2.0 + k, 1.0 - k, 0.5], 0.2, (800, 3))
+        frames.append(np.concatenate([room + rng.normal(0.0, 0.01, room.shape), apart]).astype(dtype))
+    with compiled.forced(False):
+        expected = moved_points(frames)
+    with compiled.forced(True):
+        found = moved_points(frames)
+    for mine, theirs in zip(expected, found, strict=True):
+        np.testing.assert_array_equal(theirs, mine)
+        assert len(mine) > 300
+
+
+@pytest.mark.parametrize(("target", "seed"), [("cube", 8), ("arrow", 8), ("oblique", 9), ("concave", 10)])
+def test_the_same_target_is_found(target: TargetKind, seed: int) -> None:
+    spec = CornerSceneSpec(pose="1", target=target, room=True, frames=1, places=4, clutter=5, seed=seed)
+    session, _ = simulate_corner_session(spec)
+    found = []
+    for way in (False, True):
+        with compiled.forced(way):
+            found.append(find_target(session))
+    assert found[0].by_motion
+    assert found[1].by_motion
+    for one, other in zip(found[0].sightings, found[1].sightings, strict=True):
+        assert one is not None
+        assert other is not None
+        np.testing.assert_allclose(other.corner, one.corner, atol=1e-12)
+        np.testing.assert_allclose(other.normals, one.normals, atol=1e-12)
+        assert (one.convex, one.support) == (other.convex, other.support)
+        for mine, theirs in zip(one.outlines, other.outlines, strict=True):
+            np.testing.assert_allclose(theirs, mine, atol=1e-12)
+        for plane, same in zip(one.obstacles, other.obstacles, strict=True):
+            np.testing.assert_allclose(
+                np.append(same.normal, same.offset), np.append(plane.normal, plane.offset), atol=1e-6
+            )
 
 
 def test_a_calibration_is_the_same_but_for_rounding() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from lidarpose.detect.cloud_planes import PlaneSearch, largest_component, segment_planes
 from lidarpose.detect.crop import inside_box
 from lidarpose.detect.plane_raster import mean_and_covariance
-from lidarpose.detect.trihedral_corner import FaceMask, corner_of_faces, in_outline
-from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.detect.trihedral_corner import KERNELS, FaceMask, corner_of_faces, outline_edges
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, unit
+from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.planes import Plane
 from lidarpose.model.corner_result import CornerCandidate
 from lidarpose.model.plane_patch import PlanePatch
@@ -27,6 +28,8 @@ FEWEST = 30
 # The share of the beams towards a face that have to end on it; what stands before it or beyond it takes the others.
 SHARE = 0.6
 MARGIN_M = 0.01
+# Beams farther from the outlines than this are towards no face.
+VIEW_MARGIN_M = 0.1
 FIT_STEPS = 3
 # What lies about the target beyond its faces, for the planes that border it.
 AROUND_M = 0.15
@@ -34,6 +37,31 @@ AROUND_M = 0.15
 MISSING_M = 0.35
 STANDING_ROUNDS, STANDING_HYPOTHESES, STANDING_VOXEL_M = 2, 150, 0.04
 VOXEL_KEY = np.array([1, 1 << 20, 1 << 40])
+# By how much kernels have a place done sooner.
+SAVED_S_PER_PLACE = 2e-3
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """The outlines of a reference's faces as edges, all after one another: unit directions inward (E, 3), how far along
+    each a face's points lie at least (E,), and where each face's begin (4,)."""
+
+    inward: FloatArray
+    least: FloatArray
+    starts: IntArray
+
+    @staticmethod
+    def of(reference: CornerCandidate) -> _Edges:
+        """Of the reference, were its corner the origin."""
+        edges = [
+            outline_edges(o - reference.corner, n) for o, n in zip(reference.outlines, reference.normals, strict=True)
+        ]
+        inward, least = (np.concatenate(parts) for parts in zip(*edges, strict=True))
+        return _Edges(inward, least, np.cumsum([0, *(len(least) for _, least in edges)]))
+
+    def least_at(self, corner: FloatArray, slack_m: float) -> FloatArray:
+        """How far along each edge's direction (E,) points lie at least, with the corner here and outlines widened."""
+        return np.asarray(self.least + self.inward @ corner - slack_m)
 
 
 def corner_of_normals(points: NDArray[np.floating[Any]], normals: FloatArray, sigma_m: float) -> FloatArray:
@@ -85,13 +113,15 @@ def sight_again(
     A sighting for each place, with the faces' own planes, outlines and obstacles. None where at some place one of the
     faces is not there, or most of the beams towards it end elsewhere.
     """
+    pays(SAVED_S_PER_PLACE * len(places), KERNELS)
     planes, rest = [], []
+    edges = _Edges.of(reference)
     close = [
         _about(p, reference, c, AROUND_M if part_at is None else MISSING_M)
         for p, c in zip(places, corners, strict=True)
     ]
     for local, corner in zip(close, corners, strict=True):
-        here = _planes(local, reference, corner)
+        here = _planes(local, reference, edges, corner)
         if here is None:
             return None
         planes.append(here)
@@ -99,13 +129,13 @@ def sight_again(
         rest.append(local[off > GATE_SIGMAS * reference.sigma_m])
     standing = _standing_planes(np.concatenate(rest), seed)
     if part_at is not None:
-        whole = _whole(close[part_at], planes[part_at], standing, reference)
+        whole = _whole(close[part_at], planes[part_at], standing, reference, edges)
         if whole is None:
             return None
-        reference = whole
+        reference, edges = whole, _Edges.of(whole)
     found = []
     for local, here, corner in zip(places, planes, corners, strict=True):
-        sighting = _sighting(local, here, standing, reference, corner)
+        sighting = _sighting(local, here, standing, reference, edges, corner)
         if sighting is None:
             return None
         found.append(sighting)
@@ -113,23 +143,26 @@ def sight_again(
 
 
 def _whole(
-    local: FloatArray, planes: Sequence[Plane], standing: Sequence[Plane], reference: CornerCandidate
+    local: FloatArray,
+    planes: Sequence[Plane],
+    standing: Sequence[Plane],
+    reference: CornerCandidate,
+    edges: _Edges,
 ) -> CornerCandidate | None:
     """The reference with whole faces: all that hangs together on each of its planes; None where that is no corner.
 
     What its outlines show belongs to it even so: on a face that is seen along, scan lines are far apart.
     """
-    everywhere, columns, corner = np.arange(len(local)), np.ascontiguousarray(local.T), _meeting(planes)
-    patches = _shared_out(local, [(plane, everywhere) for plane in planes], standing, reference.sigma_m)
+    corner = _meeting(planes)
+    everywhere = np.ones((3, len(local)), dtype=bool)
+    patches = _shared_out(local, [*planes, *standing], everywhere, reference.sigma_m)
+    shown = _over_outlines(local, reference, edges, corner, BORDER_M)
     single = local.astype(np.float32)
     faces = []
     for k, patch in enumerate(patches[:3]):
         mine = np.zeros(len(local), dtype=bool)
         mine[patch.indices] = True
-        whole = largest_component(single, mine, patch.plane)
-        shown = _over_outline(columns, reference, k, corner, BORDER_M)[0]
-        whole[shown[mine[shown]]] = True
-        together = np.flatnonzero(whole)
+        together = np.flatnonzero(largest_component(single, mine, patch.plane) | (shown[k] & mine))
         if len(together) < FEWEST:
             return None
         faces.append(replace(patch, indices=together))
@@ -145,13 +178,13 @@ def _sighting(
     planes: Sequence[Plane],
     standing: Sequence[Plane],
     reference: CornerCandidate,
+    edges: _Edges,
     corner: FloatArray,
 ) -> CornerCandidate | None:
     own = _meeting(planes)
     everything, local = local, _about(local, reference, own, AROUND_M)
-    columns = np.ascontiguousarray(local.T)
-    faces = [(plane, _over_outline(columns, reference, k, own, BORDER_M)[0]) for k, plane in enumerate(planes)]
-    patches = _shared_out(local, faces, standing, reference.sigma_m)
+    shown = _over_outlines(local, reference, edges, own, BORDER_M)
+    patches = _shared_out(local, [*planes, *standing], shown, reference.sigma_m)
     if min(len(patch) for patch in patches[:3]) < FEWEST:
         return None
     bordering = tuple(patch for patch in patches[3:] if len(patch) >= FEWEST)
@@ -174,38 +207,75 @@ def _meeting(planes: Sequence[Plane]) -> FloatArray:
 def _within(points: NDArray[np.floating[Any]], centre: FloatArray, radius: float) -> FloatArray:
     """Points (M, 3) within a radius: most fall out by one coordinate alone."""
     slab = inside_box(points, centre - radius, centre + radius)
+    if slab.flags.c_contiguous and pays(0.0, "detect.target_kernels"):
+        from lidarpose.detect.target_kernels import points_within
+
+        return np.asarray(points_within(slab, centre, float(radius)))
     offset = slab - centre
     near = np.flatnonzero(np.einsum("ij,ij->i", offset, offset) < radius * radius)
     return np.asarray(slab.take(near, axis=0), dtype=np.float64)
 
 
-def _planes(local: FloatArray, reference: CornerCandidate, corner: FloatArray) -> list[Plane] | None:
+def _planes(local: FloatArray, reference: CornerCandidate, edges: _Edges, corner: FloatArray) -> list[Plane] | None:
     """The three planes of the target near their known places."""
+    if pays(0.0, KERNELS):
+        from lidarpose.detect.sighting_kernels import planes_near
+
+        least, gate_m = edges.least_at(corner, NEAR_M), GATE_SIGMAS * reference.sigma_m
+        normals, sigma_m = np.ascontiguousarray(reference.normals), reference.sigma_m
+        rows = planes_near(
+            local, normals, corner, edges.inward, least, edges.starts, NEAR_M, sigma_m, gate_m, FIT_STEPS, FEWEST
+        )
+        planes = [Plane(row[:3], float(row[3])) for row in rows]
+    else:
+        planes = []
+        columns = np.ascontiguousarray(local.T)
+        for k, normal in enumerate(reference.normals):
+            chosen, height = _over_outline(columns, reference, edges, k, corner, NEAR_M)
+            plane = _fitted_near(local, chosen, height, normal, float(normal @ corner), reference.sigma_m)
+            if plane is None:
+                return None
+            planes.append(plane)
+    return planes if len(planes) == 3 and np.linalg.norm(_meeting(planes) - corner) < NEAR_M else None
+
+
+def _over_outlines(
+    local: FloatArray, reference: CornerCandidate, edges: _Edges, corner: FloatArray, within_m: float
+) -> BoolArray:
+    """Which points (N, 3) lie near each face and over its known outline (3, N), widened, with the corner here."""
+    if pays(0.0, KERNELS):
+        from lidarpose.detect.sighting_kernels import over_outlines
+
+        normals, least = np.ascontiguousarray(reference.normals), edges.least_at(corner, within_m)
+        flags, _ = over_outlines(local, normals, normals @ corner, edges.inward, least, edges.starts, within_m)
+        return np.asarray(flags)
     columns = np.ascontiguousarray(local.T)
-    planes = []
-    for k, normal in enumerate(reference.normals):
-        chosen, height = _over_outline(columns, reference, k, corner, NEAR_M)
-        if len(chosen) < FEWEST:
-            return None
-        middle = _mode(height, 4.0 * reference.sigma_m)
-        plane = _fitted(local, chosen, Plane(normal, float(normal @ corner) + middle), reference.sigma_m)
-        if plane is None:
-            return None
-        planes.append(plane)
-    return planes if np.linalg.norm(_meeting(planes) - corner) < NEAR_M else None
+    flags = np.zeros((3, len(local)), dtype=bool)
+    for k, row in enumerate(flags):
+        row[_over_outline(columns, reference, edges, k, corner, within_m)[0]] = True
+    return flags
 
 
 def _over_outline(
-    columns: FloatArray, reference: CornerCandidate, face: int, corner: FloatArray, within_m: float
+    columns: FloatArray, reference: CornerCandidate, edges: _Edges, face: int, corner: FloatArray, within_m: float
 ) -> tuple[IntArray, FloatArray]:
-    """Which points (3, N) lie near a face and over its known outline, widened by `within_m`, were the target's corner
-    here, and their heights above it."""
-    normal = reference.normals[face]
+    """Which points (3, N) lie near a face and over its known outline, and their heights above it."""
+    normal, mine = reference.normals[face], slice(edges.starts[face], edges.starts[face + 1])
     height = normal @ columns - normal @ corner
     chosen = np.flatnonzero(np.abs(height) < within_m)
     flat = columns.take(chosen, axis=1) - normal[:, None] * height[chosen]
-    chosen = chosen[in_outline(flat, reference.outlines[face] + (corner - reference.corner), normal, within_m)]
+    least = edges.least_at(corner, within_m)[mine]
+    chosen = chosen[(edges.inward[mine] @ flat > least[:, None]).all(axis=0)]
     return chosen, height[chosen]
+
+
+def _fitted_near(
+    local: FloatArray, chosen: IntArray, height: FloatArray, normal: FloatArray, offset: float, sigma_m: float
+) -> Plane | None:
+    """The plane through those of the chosen points at whose height above a first one most lie."""
+    if len(chosen) < FEWEST:
+        return None
+    return _fitted(local, chosen, Plane(normal, offset + _mode(height, 4.0 * sigma_m)), sigma_m)
 
 
 def _fitted(local: FloatArray, chosen: IntArray, plane: Plane, sigma_m: float) -> Plane | None:
@@ -234,22 +304,28 @@ def _standing_planes(rest: FloatArray, seed: int) -> list[Plane]:
 
 
 def _shared_out(
-    local: FloatArray, faces: Sequence[tuple[Plane, IntArray]], standing: Sequence[Plane], sigma_m: float
+    local: FloatArray, planes: Sequence[Plane], eligible: BoolArray, sigma_m: float
 ) -> tuple[PlanePatch, ...]:
-    """The faces, and the planes that stand still, each with the points (N, 3) that are nearest to it."""
-    everywhere = np.arange(len(local))
-    surfaces = [*faces, *((plane, everywhere) for plane in standing)]
-    distance = np.full((len(surfaces), len(local)), np.inf)
-    for row, (plane, chosen) in zip(distance, surfaces, strict=True):
-        row[chosen] = np.abs(plane.distance(local[chosen]))
-    nearest = np.argmin(distance, axis=0)
+    """Planes, each with the points (N, 3) nearest to it; on the first ones only eligible points (E, N) count."""
     gate_m = GATE_SIGMAS * sigma_m
-    patches = []
-    for k, (plane, _) in enumerate(surfaces):
-        mine = np.flatnonzero((nearest == k) & (distance[k] < gate_m))
-        spread_m = float(np.sqrt(np.mean(distance[k, mine] ** 2))) if len(mine) else sigma_m
-        patches.append(PlanePatch(plane, mine, spread_m))
-    return tuple(patches)
+    rows = np.array([[*plane.normal, plane.offset] for plane in planes])
+    if pays(0.0, KERNELS):
+        from lidarpose.detect.sighting_kernels import shared_out
+
+        owner, spread_m = shared_out(local, rows, eligible, gate_m)
+        patches = [np.flatnonzero(owner == k) for k in range(len(planes))]
+        return tuple(
+            PlanePatch(plane, mine, float(spread) if len(mine) else sigma_m)
+            for plane, mine, spread in zip(planes, patches, spread_m, strict=True)
+        )
+    distance = np.abs(rows[:, :3] @ local.T - rows[:, 3:])
+    distance[: len(eligible)][~eligible] = np.inf
+    nearest = np.argmin(distance, axis=0)
+    patches = [np.flatnonzero((nearest == k) & (row < gate_m)) for k, row in enumerate(distance)]
+    return tuple(
+        PlanePatch(plane, mine, float(np.sqrt(np.mean(row[mine] ** 2))) if len(mine) else sigma_m)
+        for plane, mine, row in zip(planes, patches, distance, strict=True)
+    )
 
 
 def _is_in_view(local: FloatArray, found: CornerCandidate, reference: CornerCandidate) -> bool:
@@ -257,10 +333,17 @@ def _is_in_view(local: FloatArray, found: CornerCandidate, reference: CornerCand
     shift = found.corner - reference.corner
     a, b, c = (o + shift for o in reference.outlines)
     range_m = np.sqrt(np.einsum("ij,ij->i", local, local))
+    axis, cosine = _cone(np.concatenate([a, b, c]), found.corner)
+    index = np.flatnonzero(local @ axis > cosine * range_m)
+    range_m = range_m[index]
+    rays = local.take(index, axis=0) / range_m[:, None]
     mask = FaceMask(found.corner, found.normals, found.convex, (a, b, c), found.obstacles, MARGIN_M)
-    rays = np.ascontiguousarray(local.T) / range_m
-    towards, met = mask.select(rays.T, range_m, np.inf)
-    _, expected = mask.meet(rays.take(towards, axis=1).T)
-    on_face = met[np.abs(range_m[towards] - expected) < 2.0 * GATE_SIGMAS * found.sigma_m]
-    wanted, there = np.bincount(met, minlength=3), np.bincount(on_face, minlength=3)
+    wanted, there = mask.endings(rays, range_m, 2.0 * GATE_SIGMAS * found.sigma_m)
     return bool((there >= SHARE * wanted).all() and (there >= FEWEST // 2).all())
+
+
+def _cone(points: FloatArray, corner: FloatArray) -> tuple[FloatArray, float]:
+    """All directions to points (N, 3) about a corner, and a little more: a cone's axis (3,) and its angle's cosine."""
+    axis = unit(corner)
+    widest = float(np.arccos(min((unit(points) @ axis).min(), 1.0))) + VIEW_MARGIN_M / float(np.linalg.norm(corner))
+    return axis, float(np.cos(min(widest, np.pi)))

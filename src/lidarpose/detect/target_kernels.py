@@ -73,6 +73,91 @@ def points_in_box(flat: Any, step: int, count: int, middle: Any, half: Any) -> A
 
 
 @kernel
+def points_within(points: Any, centre: Any, radius: float) -> Any:
+    """Those (M, 3) of points (N, 3) that lie within a radius of a centre (3,), in double precision."""
+    index = np.empty(len(points) + 1, np.uint32)
+    kept = np.uint64(0)
+    for i in range(len(points)):
+        x, y, z = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        index[kept] = i
+        kept += np.uint64(x * x + y * y + z * z < radius * radius)
+    inside = np.empty((np.int64(kept), 3))
+    for j in range(len(inside)):
+        for axis in range(3):
+            inside[j, axis] = points[index[j], axis]
+    return inside
+
+
+@kernel
+def mark_cells(flat: Any, low: Any, scale: Any, reach: Any, strides: Any, bit: Any, taken: Any) -> Any:
+    """Set a bit in `taken` for each cell that holds any point; the cell (N,) of each, -1 beyond reach.
+
+    `flat` (3 N,) holds x, y, z of points one after the other; see `moved_points`.
+    """
+    cells = np.empty(len(flat) // 3, np.int32)
+    a, b, c = low[0], low[1], low[2]
+    p, q, r = np.int32(strides[0]), np.int32(strides[1]), np.int32(strides[2])
+    for k in range(len(cells)):
+        i = np.uint64(3) * np.uint64(k)
+        x, y, z = np.float32(flat[i]), np.float32(flat[i + np.uint64(1)]), np.float32(flat[i + np.uint64(2)])
+        cell = np.int32((x - a) * scale) * p + np.int32((y - b) * scale) * q + np.int32((z - c) * scale) * r
+        cells[k] = cell if (abs(x) < reach) & (abs(y) < reach) & (abs(z) < reach) else np.int32(-1)
+    for k in range(len(cells)):
+        if cells[k] >= 0:
+            taken[np.uint32(cells[k])] |= bit
+    return cells
+
+
+@kernel
+def left_alone(
+    flat: Any,
+    cells: Any,
+    low: Any,
+    scale: Any,
+    strides: Any,
+    others: Any,
+    taken: Any,
+    slack: Any,
+    fewest: int,
+) -> Any:
+    """Those (M,) of points in and nearly in whose cells no others are, in cells that hold enough such points.
+
+    `flat` and `cells` as `mark_cells` has them.
+    """
+    alone = np.empty(len(cells) + 1, np.uint32)
+    first = np.uint64(0)
+    for k in range(len(cells)):
+        alone[first] = k
+        first += np.uint64((cells[k] >= 0) & ((taken[np.uint32(max(cells[k], 0))] & others) == 0))
+    left = 0
+    ends = np.empty((3, 2), np.int64)
+    for j in range(np.int64(first)):
+        i = np.int64(alone[j])
+        # From the cell that holds a point moved back to the one that holds it moved on, along all axes.
+        for axis in range(3):
+            at = (np.float32(flat[3 * i + axis]) - low[axis]) * scale
+            ends[axis, 0], ends[axis, 1] = np.int32(at - slack), np.int32(at + slack)
+        met = np.uint8(0)
+        for n in range(8):
+            met |= taken[ends[0, n & 1] * strides[0] + ends[1, n >> 1 & 1] * strides[1] + ends[2, n >> 2] * strides[2]]
+        if met & others:
+            continue
+        alone[left] = i
+        left += 1
+    ordered = np.empty(left, np.int32)
+    for j in range(left):
+        ordered[j] = cells[alone[j]]
+    ordered.sort()
+    kept = 0
+    for j in range(left):
+        last = np.searchsorted(ordered, cells[alone[j]]) + fewest - 1
+        if last < left and ordered[last] == cells[alone[j]]:
+            alone[kept] = alone[j]
+            kept += 1
+    return alone[:kept].astype(np.int64)
+
+
+@kernel
 def faces_met(
     rays: Any,
     range_m: Any,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarpose.detect.crop import inside_box
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, cross3, perpendicular_pair, unit
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.planes import Plane, intersect_three_planes
@@ -28,16 +29,31 @@ ONE_SIDED = 0.9
 OUTLINE_DIRECTIONS = 64
 # An outline ends at a face's last scan line, and the face within this of it, if nothing else lies there.
 RIM_M = 0.02
-# By how much kernels are done sooner, on one core.
+# By how much kernels are done sooner, on one core: a beam, or the faces of one corner.
 SAVED_S_PER_BEAM = 1e-7
+SAVED_S_PER_CORNER = 5e-4
+KERNELS = "detect.sighting_kernels"
 
 
+@dataclass(frozen=True, eq=False)
 class _Surface:
     """A patch with its points (M, 3) and their bounding box."""
 
-    def __init__(self, patch: PlanePatch, points: FloatArray) -> None:
-        self.patch, self.points = patch, points
-        self.low, self.high = points.min(axis=0), points.max(axis=0)
+    patch: PlanePatch
+    points: FloatArray
+
+    @cached_property
+    def low(self) -> FloatArray:
+        return np.asarray(self._columns.min(axis=1))
+
+    @cached_property
+    def high(self) -> FloatArray:
+        return np.asarray(self._columns.max(axis=1))
+
+    @cached_property
+    def _columns(self) -> FloatArray:
+        # Along the columns NumPy finds a least number ten times as quickly as along the rows.
+        return np.ascontiguousarray(self.points.T)
 
 
 def find_corners(
@@ -95,28 +111,12 @@ def _meeting_triples(surfaces: list[_Surface]) -> tuple[IntArray, FloatArray]:
 
 def _candidate(surfaces: list[_Surface], triple: IntArray, corner: FloatArray) -> CornerCandidate | None:
     faces = [surfaces[k].patch for k in triple]
-    local = []
-    for k in triple:
-        around = surfaces[k].points
-        offset = around - corner
-        distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
-        around = around[distance < REACH_M]
-        if len(around) < MIN_FACE_POINTS or distance.min() > MAX_MISSING_M:
-            return None
-        local.append(around)
-    distances = [np.linalg.norm(p - corner, axis=1) for p in local]
-    reach = min(quantile(d, 0.98) for d in distances)
-    convex = _common_side(_next_to_corner(local, distances, reach), faces)
-    if convex is None:
-        # A face may go on past a narrow one, as the floor does past the side of a niche.
-        convex = _common_side(_next_to_corner(local, distances, _narrowest_m(local, faces, corner)), faces)
-    if convex is None:
+    points = [surfaces[k].points for k in triple]
+    compiled = pays(SAVED_S_PER_CORNER, KERNELS)
+    met = _met_compiled(points, faces, corner) if compiled else _met(points, faces, corner)
+    if met is None or min(len(p) for p in met[1]) < MIN_FACE_POINTS:
         return None
-    # No farther from the corner than the smallest face reaches: a wall's or the ground's rest is no target.
-    local = [p[d <= 1.3 * reach] for p, d in zip(local, distances, strict=True)]
-    local = [_on_its_side(p, k, faces, convex) for k, p in enumerate(local)]
-    if min(len(p) for p in local) < MIN_FACE_POINTS:
-        return None
+    convex, local = met
     outlines = [convex_outline(p, f.plane) for p, f in zip(local, faces, strict=True)]
     if any(len(o) < 3 for o in outlines):
         return None
@@ -130,6 +130,49 @@ def _candidate(surfaces: list[_Surface], triple: IntArray, corner: FloatArray) -
         min(len(p) for p in local),
         float(np.median([f.sigma_m for f in faces])),
     )
+
+
+def _met(points: list[FloatArray], faces: list[PlanePatch], corner: FloatArray) -> tuple[bool, list[FloatArray]] | None:
+    """Whether the edges of three faces are convex, and which of their points are next to the corner; None if these
+    faces make none."""
+    local, distances = [], []
+    for around in points:
+        offset = around - corner
+        distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
+        near = np.flatnonzero(distance < REACH_M)
+        if len(near) < MIN_FACE_POINTS or distance.min() > MAX_MISSING_M:
+            return None
+        local.append(around.take(near, axis=0))
+        distances.append(distance[near])
+    reach = min(quantile(d, 0.98) for d in distances)
+    convex = _common_side(_next_to_corner(local, distances, reach), faces)
+    if convex is None:
+        # A face may go on past a narrow one, as the floor does past the side of a niche.
+        convex = _common_side(_next_to_corner(local, distances, _narrowest_m(local, faces, corner)), faces)
+    if convex is None:
+        return None
+    # No farther from the corner than the smallest face reaches: a wall's or the ground's rest is no target.
+    local = [p[d <= 1.3 * reach] for p, d in zip(local, distances, strict=True)]
+    return convex, [_on_its_side(p, k, faces, convex) for k, p in enumerate(local)]
+
+
+def _met_compiled(
+    points: list[FloatArray], faces: list[PlanePatch], corner: FloatArray
+) -> tuple[bool, list[FloatArray]] | None:
+    """`_met` by kernels."""
+    from lidarpose.detect.sighting_kernels import faces_of_corner
+
+    starts = np.cumsum([0, *(len(p) for p in points)])
+    planes = np.array([[*face.plane.normal, face.plane.offset] for face in faces])
+    sigmas = np.array([face.sigma_m for face in faces])
+    tolerance = 3.0 * np.maximum(sigmas, sigmas[:, None])
+    everyone = np.concatenate(points)
+    side, keep = faces_of_corner(
+        everyone, starts, corner, planes, tolerance, REACH_M, MAX_MISSING_M, MIN_FACE_POINTS, ONE_SIDED
+    )
+    if side < 0:
+        return None
+    return side == 1, [everyone[a:b][keep[a:b]] for a, b in pairwise(starts)]
 
 
 def _common_side(local: list[FloatArray], faces: list[PlanePatch]) -> bool | None:
@@ -176,15 +219,22 @@ def _on_its_side(points: FloatArray, face: int, faces: list[PlanePatch], convex:
     return np.asarray(points[keep])
 
 
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, OUTLINE_DIRECTIONS, endpoint=False)
+_ROUND = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+
+
 def convex_outline(points: FloatArray, plane: Plane) -> FloatArray:
     """The convex outline (K, 3) of points on a plane, counter-clockwise seen from the normal's side.
 
     Its vertices are the points farthest out in `OUTLINE_DIRECTIONS` directions.
     """
-    u, v = perpendicular_pair(plane.normal)
-    angle = np.linspace(0.0, 2.0 * np.pi, OUTLINE_DIRECTIONS, endpoint=False)
-    out = (np.column_stack([np.cos(angle), np.sin(angle)]) @ np.stack([u, v])) @ points.T
-    farthest = np.argmax(out, axis=1)
+    directions = _ROUND @ np.stack(perpendicular_pair(plane.normal))
+    if points.dtype == np.float64 and points.flags.c_contiguous and pays(0.0, KERNELS):
+        from lidarpose.detect.sighting_kernels import farthest as farthest_out
+
+        farthest = farthest_out(points, directions)
+    else:
+        farthest = np.argmax(directions @ points.T, axis=1)
     corners = farthest[farthest != np.append(farthest[-1], farthest[:-1])]
     return plane.project(points[corners])
 
@@ -192,13 +242,13 @@ def convex_outline(points: FloatArray, plane: Plane) -> FloatArray:
 def _obstacles(surfaces: list[_Surface], triple: IntArray, local: list[FloatArray]) -> tuple[Plane, ...]:
     """Planes of other patches that touch the faces: what a face's beam meets below the target's foot."""
     all_local = np.concatenate(local)
-    low, high = all_local.min(axis=0) - 0.1, all_local.max(axis=0) + 0.1
+    columns = np.ascontiguousarray(all_local.T)
+    low, high = columns.min(axis=1) - 0.1, columns.max(axis=1) + 0.1
     found = []
     for k, surface in enumerate(surfaces):
         if k in triple or (surface.low > high).any() or (surface.high < low).any():
             continue
-        theirs = surface.points
-        if np.count_nonzero(((theirs > low) & (theirs < high)).all(axis=1)) < 20:
+        if len(inside_box(surface.points, low, high)) < 20:
             continue
         height = surface.patch.plane.distance(all_local)
         # It borders the target only if the target stands wholly on its free side, and close to it.
@@ -260,11 +310,17 @@ class FaceMask:
         return np.concatenate(indices), np.concatenate(faces)
 
     def _select_compiled(self, rays: FloatArray, range_m: FloatArray, gate_m: float) -> tuple[IntArray, IntArray]:
+        found = self._faces_met(rays, range_m, gate_m)
+        indices = [np.flatnonzero(found == j) for j in range(3)]
+        return np.concatenate(indices), np.repeat(np.arange(3), [len(index) for index in indices])
+
+    def _faces_met(self, rays: FloatArray, range_m: FloatArray, gate_m: float) -> NDArray[np.int8]:
+        """By kernels: the face (N,) that each ray (3, N) and range is of, or -1."""
         from lidarpose.detect.target_kernels import faces_met
 
         edges = [(inward, least - RIM_M) for inward, least in self._edges_of]
         planes = np.array([[*plane.normal, plane.offset] for plane in self.obstacles]).reshape(-1, 4)
-        found = faces_met(
+        found: NDArray[np.int8] = faces_met(
             rays,
             np.asarray(range_m, dtype=np.float64),
             float(gate_m),
@@ -278,8 +334,20 @@ class FaceMask:
             planes,
             np.array([[self._off_obstacle_m(j, plane) for plane in self.obstacles] for j in range(3)]).reshape(3, -1),
         )
-        indices = [np.flatnonzero(found == j) for j in range(3)]
-        return np.concatenate(indices), np.repeat(np.arange(3), [len(index) for index in indices])
+        return found
+
+    def endings(self, directions: FloatArray, range_m: FloatArray, gate_m: float) -> tuple[IntArray, IntArray]:
+        """By face: how many of the beams (N, 3) are towards it (3,), and how many of their ranges (N,) end on it (3,),
+        within the gate."""
+        if pays(0.0, "detect.target_kernels"):
+            rays = np.ascontiguousarray(directions.T)
+            faces = (self._faces_met(rays, range_m, gate) for gate in (np.inf, gate_m))
+            wanted, there = (np.bincount(face + 1, minlength=4)[1:] for face in faces)
+            return wanted, there
+        towards, met = self.select(directions, range_m, np.inf)
+        _, expected = self.meet(directions[towards])
+        on_face = met[np.abs(range_m[towards] - expected) < gate_m]
+        return np.bincount(met, minlength=3), np.bincount(on_face, minlength=3)
 
     def on_rim(self, face: int, rays: FloatArray) -> BoolArray:
         """Which rays (3, N) to a face pass outside its outline, within its rim."""
@@ -289,8 +357,8 @@ class FaceMask:
 
     @cached_property
     def _edges_of(self) -> list[tuple[FloatArray, FloatArray]]:
-        """By face: its outline's edges (see `_edges`)."""
-        return [_edges(o, n, 0.0) for o, n in zip(self.outlines, self.normals, strict=True)]
+        """By face: its outline's edges."""
+        return [outline_edges(o, n) for o, n in zip(self.outlines, self.normals, strict=True)]
 
     def _off_edge_m(self, face: int, other: int) -> float:
         """How far a face's points have to be from another's plane to be off their common edge."""
@@ -340,13 +408,7 @@ class FaceMask:
         return np.asarray(good)
 
 
-def in_outline(points: FloatArray, outline: FloatArray, normal: FloatArray, slack_m: float) -> BoolArray:
-    """Which points (3, N) of a plane lie in a convex outline (K, 3), widened by `slack_m`."""
-    inward, least = _edges(outline, normal, slack_m)
-    return np.asarray((inward @ points > least[:, None]).all(axis=0))
-
-
-def _edges(outline: FloatArray, normal: FloatArray, slack_m: float) -> tuple[FloatArray, FloatArray]:
+def outline_edges(outline: FloatArray, normal: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Unit directions (E, 3) inward from an outline's edges, and how far along each its points lie at least (E,)."""
     x, y, z = (np.concatenate([outline[1:], outline[:1]]) - outline).T
     a, b, c = normal
@@ -354,4 +416,10 @@ def _edges(outline: FloatArray, normal: FloatArray, slack_m: float) -> tuple[Flo
     length = np.sqrt(np.einsum("ij,ij->i", inward, inward))
     keep = np.flatnonzero(length > 1e-9)
     inward = inward.take(keep, axis=0) / length.take(keep)[:, None]
-    return inward, np.einsum("ij,ij->i", inward, outline.take(keep, axis=0)) - slack_m
+    return inward, np.einsum("ij,ij->i", inward, outline.take(keep, axis=0))
+
+
+def in_outline(points: FloatArray, outline: FloatArray, normal: FloatArray, slack_m: float) -> BoolArray:
+    """Which points (3, N) of a plane lie in a convex outline (K, 3), widened by `slack_m`."""
+    inward, least = outline_edges(outline, normal)
+    return np.asarray((inward @ points > (least - slack_m)[:, None]).all(axis=0))

@@ -1,0 +1,284 @@
+"""The steps of `detect.known_corner` and the heart of `detect.trihedral_corner`, compiled by numba; imported only where
+they pay.
+
+Decisions are those of the NumPy ways; sums and products may differ by their rounding.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lidarpose.detect.patch_kernels import eigen
+from lidarpose.geometry.compiled import kernel
+
+
+@kernel
+def over_outlines(points: Any, normals: Any, heights: Any, inward: Any, least: Any, starts: Any, within: float) -> Any:
+    """Which points (N, 3) lie near each of three faces and over its outline (3, N), and how high above it (3, N).
+
+    The outlines' edges are those of `trihedral_corner.outline_edges`, all after one another; each begins at its start.
+    """
+    flags, height = np.zeros((3, len(points)), np.bool_), np.empty((3, len(points)))
+    for face in range(3):
+        a, b, c, offset = normals[face, 0], normals[face, 1], normals[face, 2], heights[face]
+        edges, ends = inward[starts[face] : starts[face + 1]], least[starts[face] : starts[face + 1]]
+        for i in range(len(points)):
+            up = a * points[i, 0] + b * points[i, 1] + c * points[i, 2] - offset
+            height[face, i] = up
+            if not abs(up) < within:
+                continue
+            x, y, z = points[i, 0] - up * a, points[i, 1] - up * b, points[i, 2] - up * c
+            inside = True
+            for e in range(len(ends)):
+                if not edges[e, 0] * x + edges[e, 1] * y + edges[e, 2] * z > ends[e]:
+                    inside = False
+                    break
+            flags[face, i] = inside
+    return flags, height
+
+
+@kernel
+def _mode(values: Any, width: float) -> Any:
+    """`known_corner._mode`."""
+    ordered = np.sort(values)
+    best = first = end = 0
+    for k in range(len(ordered)):
+        while end < len(ordered) and ordered[end] <= ordered[k] + width:
+            end += 1
+        if end - k > best:
+            best, first = end - k, k
+    total = 0.0
+    for k in range(first, first + best):
+        total += ordered[k]
+    return total / best
+
+
+@kernel
+def _fitted(points: Any, chosen: Any, plane: Any, gate: float, steps: int, fewest: int) -> Any:
+    """Fit a plane, normal and offset (4,), to those of the chosen points that are near it, in place; whether it is
+    one."""
+    sums, second = np.empty(3), np.empty((3, 3))
+    for _ in range(steps):
+        # About a point on the plane, where differences of squares lose no digits.
+        p, q, r = plane[0] * plane[3], plane[1] * plane[3], plane[2] * plane[3]
+        count = 0
+        sums[:] = 0.0
+        second[:] = 0.0
+        for i in chosen:
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            if abs(plane[0] * x + plane[1] * y + plane[2] * z - plane[3]) < gate:
+                count += 1
+                x, y, z = x - p, y - q, z - r
+                sums[0] += x
+                sums[1] += y
+                sums[2] += z
+                second[0, 0] += x * x
+                second[0, 1] += x * y
+                second[0, 2] += x * z
+                second[1, 1] += y * y
+                second[1, 2] += y * z
+                second[2, 2] += z * z
+        if count < fewest:
+            return False
+        for i in range(3):
+            for j in range(i, 3):
+                second[i, j] = (second[i, j] - sums[i] * sums[j] / count) / (count - 1)
+                second[j, i] = second[i, j]
+        values, axes = eigen(second)
+        if values[1] < 4.0 * values[0]:
+            return False
+        a, b, c = axes[0, 0], axes[1, 0], axes[2, 0]
+        if not a * plane[0] + b * plane[1] + c * plane[2] > 0.0:
+            a, b, c = -a, -b, -c
+        plane[0], plane[1], plane[2] = a, b, c
+        plane[3] = a * (p + sums[0] / count) + b * (q + sums[1] / count) + c * (r + sums[2] / count)
+    return True
+
+
+@kernel
+def planes_near(
+    points: Any,
+    normals: Any,
+    corner: Any,
+    inward: Any,
+    least: Any,
+    starts: Any,
+    within: float,
+    sigma: float,
+    gate: float,
+    steps: int,
+    fewest: int,
+) -> Any:
+    """Planes (K, 4) as normal and offset of the three faces near where they should be; fewer if one is not there."""
+    planes, heights = np.empty((3, 4)), np.empty(3)
+    for face in range(3):
+        heights[face] = normals[face, 0] * corner[0] + normals[face, 1] * corner[1] + normals[face, 2] * corner[2]
+    flags, height = over_outlines(points, normals, heights, inward, least, starts, within)
+    for face in range(3):
+        chosen = np.flatnonzero(flags[face])
+        if len(chosen) < fewest:
+            return planes[:face]
+        for i in range(3):
+            planes[face, i] = normals[face, i]
+        planes[face, 3] = heights[face] + _mode(height[face][chosen], 4.0 * sigma)
+        if not _fitted(points, chosen, planes[face], gate, steps, fewest):
+            return planes[:face]
+    return planes
+
+
+@kernel
+def shared_out(points: Any, planes: Any, eligible: Any, gate: float) -> Any:
+    """Which of the planes (K, 4) each point (N, 3) is nearest to, -1 for none, and their points' root mean square
+    distance (K,). On the first ones only eligible points (E, N) count."""
+    owner = np.empty(len(points), np.int8)
+    count, squares = np.zeros(len(planes), np.int64), np.zeros(len(planes))
+    for i in range(len(points)):
+        best, nearest = np.inf, 0
+        for k in range(len(planes)):
+            if k < len(eligible) and not eligible[k, i]:
+                continue
+            off = abs(
+                planes[k, 0] * points[i, 0] + planes[k, 1] * points[i, 1] + planes[k, 2] * points[i, 2] - planes[k, 3]
+            )
+            if off < best:
+                best, nearest = off, k
+        owner[i] = -1
+        if best < gate:
+            owner[i] = nearest
+            count[nearest] += 1
+            squares[nearest] += best * best
+    for k in range(len(planes)):
+        squares[k] = np.sqrt(squares[k] / count[k]) if count[k] > 0 else np.nan
+    return owner, squares
+
+
+@kernel
+def _quantile(values: Any, share: float) -> Any:
+    """`geometry.robust.quantile`."""
+    ordered = np.sort(values)
+    at = share * (len(ordered) - 1)
+    k = int(at)
+    low, high, part = ordered[k], ordered[min(k + 1, len(ordered) - 1)], at - k
+    return low + (high - low) * part if part < 0.5 else high - (high - low) * (1.0 - part)
+
+
+@kernel
+def _common_side(height: Any, face: Any, near: Any, tolerance: Any, one_sided: float, fewest: int) -> int:
+    """`trihedral_corner._common_side`: 1 convex, 0 concave, -1 neither; of the points that are near, where enough are.
+
+    `height` (3, N) above each of the planes, `face` (N,) of each point, -1 for none.
+    """
+    found = -2
+    for i in range(3):
+        count = together = 0
+        for n in range(len(face)):
+            together += face[n] == i
+            count += (face[n] == i) & near[n]
+        everyone = count < fewest
+        count = together if everyone else count
+        for j in range(3):
+            if i == j:
+                continue
+            below = above = 0
+            for n in range(len(face)):
+                if face[n] == i and (everyone or near[n]):
+                    below += height[j, n] < tolerance[i, j]
+                    above += height[j, n] > -tolerance[i, j]
+            side = 1 if below / count >= one_sided else 0 if above / count >= one_sided else -1
+            if side < 0 or (found >= 0 and side != found):
+                return -1
+            found = side
+    return found
+
+
+@kernel
+def faces_of_corner(
+    points: Any,
+    starts: Any,
+    corner: Any,
+    planes: Any,
+    tolerance: Any,
+    reach: float,
+    missing: float,
+    fewest: int,
+    one_sided: float,
+) -> Any:
+    """How the three faces of a corner meet: 1 convex, 0 concave, -1 not at all; and which of their points are kept.
+
+    `points` (N, 3) of one face after the other, each from its start; `planes` (3, 4); `tolerance` (3, 3) m.
+    """
+    n = len(points)
+    keep, face = np.zeros(n, np.bool_), np.full(n, -1, np.int8)
+    distance, height = np.empty(n), np.empty((3, n))
+    nearest = np.inf
+    for k in range(3):
+        closest, count = np.inf, 0
+        for i in range(starts[k], starts[k + 1]):
+            x, y, z = points[i, 0] - corner[0], points[i, 1] - corner[1], points[i, 2] - corner[2]
+            distance[i] = np.sqrt(x * x + y * y + z * z)
+            closest = min(closest, distance[i])
+            if distance[i] < reach:
+                face[i] = k
+                count += 1
+        if count < fewest or closest > missing:
+            return -1, keep
+        mine = face[starts[k] : starts[k + 1]] == k
+        nearest = min(nearest, _quantile(distance[starts[k] : starts[k + 1]][mine], 0.98))
+    for i in range(n):
+        for k in range(3):
+            height[k, i] = (
+                planes[k, 0] * points[i, 0] + planes[k, 1] * points[i, 1] + planes[k, 2] * points[i, 2] - planes[k, 3]
+            )
+    side = _common_side(height, face, distance <= 0.7 * nearest, tolerance, one_sided, fewest)
+    if side < 0:
+        narrowest = _narrowest(points, face, corner, planes)
+        side = _common_side(height, face, distance <= 0.7 * narrowest, tolerance, one_sided, fewest)
+    if side < 0:
+        return -1, keep
+    for i in range(n):
+        k = face[i]
+        if k < 0 or distance[i] > 1.3 * nearest:
+            continue
+        good = True
+        for j in range(3):
+            if j != k and not (height[j, i] < tolerance[k, j] if side == 1 else height[j, i] > -tolerance[k, j]):
+                good = False
+        keep[i] = good
+    return side, keep
+
+
+@kernel
+def _narrowest(points: Any, face: Any, corner: Any, planes: Any) -> Any:
+    """`trihedral_corner._narrowest_m`."""
+    found = np.inf
+    for first in range(2):
+        for second in range(first + 1, 3):
+            a, b = planes[first], planes[second]
+            x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+            length = np.sqrt(x * x + y * y + z * z)
+            for k in (first, second):
+                mine = np.flatnonzero(face == k)
+                along = np.empty(len(mine))
+                for j in range(len(mine)):
+                    i = mine[j]
+                    p, q, r = points[i, 0] - corner[0], points[i, 1] - corner[1], points[i, 2] - corner[2]
+                    along[j] = abs(p * x + q * y + r * z) / length
+                found = min(found, _quantile(along, 0.98))
+    return found
+
+
+@kernel
+def farthest(points: Any, directions: Any) -> Any:
+    """The point (D,) of points (N, 3) that is farthest out in each direction (D, 3)."""
+    found = np.zeros(len(directions), np.int64)
+    for d in range(len(directions)):
+        a, b, c = directions[d, 0], directions[d, 1], directions[d, 2]
+        best = -np.inf
+        for i in range(len(points)):
+            out = a * points[i, 0] + b * points[i, 1] + c * points[i, 2]
+            if out > best:
+                best = out
+                found[d] = i
+    return found
