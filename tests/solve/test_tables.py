@@ -1,13 +1,24 @@
 """What is fitted as one table is what each piece gives by itself, and what slower, independent ways give."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from lidarpose.geometry.lines import fit_line2
+from lidarpose.geometry.planes import Plane
 from lidarpose.geometry.robust import row_medians
 from lidarpose.geometry.se3 import Pose, exp_se3, log_se3, rotation_z
 from lidarpose.model.observation import ScanLine
-from lidarpose.solve.light_plane import LightPlane, StripeOnPanel, fit_light_plane, fit_light_planes
+from lidarpose.solve.light_plane import (
+    LightPlane,
+    StripeOnPanel,
+    StripePair,
+    fit_light_plane,
+    fit_light_planes,
+    stripe_pair,
+    stripe_pairs,
+)
 from lidarpose.solve.line_pair import fit_line_pairs, fit_scan_line, fit_scan_lines, free_directions
 from lidarpose.solve.turntable_function import motions_of_pairs
 
@@ -126,6 +137,29 @@ def test_a_place_without_a_plane_leaves_the_others_theirs() -> None:
     assert isinstance(found[2], ValueError)
     with pytest.raises(ValueError, match="four points"):
         fit_light_plane(few)
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.2])
+def test_stripes_of_many_places_leave_as_each_alone(outliers: float) -> None:
+    rng = np.random.default_rng(9)
+    panels = (Plane(np.array([0.6, 0.0, -0.8]), -1.0), Plane(np.array([-0.6, 0.05, -0.8]), -1.0))
+    places = [stripes_of_place(rng, outliers=outliers) for _ in range(12)]
+    lights = [light for light in fit_light_planes(places) if isinstance(light, LightPlane)]
+    # One place on parallel panels, and one without points on a panel, have none.
+    both = [panels] * 11 + [(panels[0], panels[0])]
+    lights[3] = replace(lights[3], weights=(lights[3].weights[0], 0.0 * lights[3].weights[1]))
+    for k, found in enumerate(stripe_pairs(both, places, lights)):
+        if k in (3, 11):
+            assert isinstance(found, ValueError)
+            with pytest.raises(ValueError, match=str(found)):
+                stripe_pair(both[k], places[k], lights[k])
+            continue
+        assert isinstance(found, StripePair)
+        alone = stripe_pair(both[k], places[k], lights[k])
+        np.testing.assert_allclose(found.E_camera, alone.E_camera, atol=1e-12)
+        np.testing.assert_allclose(found.directions_camera, alone.directions_camera, atol=1e-12)
+        np.testing.assert_allclose(found.extents_m, alone.extents_m, atol=1e-12)
+        assert found.alpha_rad == pytest.approx(alone.alpha_rad, abs=1e-12)
 
 
 def test_motions_go_through_their_pairs_of_poses() -> None:

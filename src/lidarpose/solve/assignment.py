@@ -21,6 +21,7 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.camera import Camera
 from lidarpose.model.observation import LeftOut, PlaceFeatures, PlaceObservation, ScanLine
+from lidarpose.model.scan import polar_to_points
 from lidarpose.model.targets import Panel
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.solve.assignment_blind import choose_without_stripes
@@ -34,6 +35,7 @@ from lidarpose.solve.assignment_candidates import (
 from lidarpose.solve.assignment_decision import decide
 from lidarpose.solve.assignment_solutions import Solution, solutions_of, support_of
 from lidarpose.solve.light_plane import StripePair
+from lidarpose.solve.line_pair import FittedLines
 from lidarpose.solve.panel_pose import PanelPose
 from lidarpose.solve.turntable_function import (
     require_readings,
@@ -156,14 +158,16 @@ def _assignment(
     figures: dict[str, float],
 ) -> Assignment:
     support = support_of(best)
+    chosen = {int(k): pool.candidates[best.chosen[k]] for k in np.flatnonzero(support)}
+    pieces = _pieces(places, chosen)
     assigned = []
     stripe_pairs = {}
     for k, place in enumerate(places):
         if not support[k]:
             reasons.setdefault(k, "its scan lines do not fit the motion of the other places")
             continue
-        candidate = pool.candidates[best.chosen[k]]
-        lines = {key: _whole(place, candidate, key) for key in (0, 1)}
+        candidate = chosen[k]
+        lines = {key: _joined([place.lines[candidate.lines[key]], *pieces.get((k, key), [])]) for key in (0, 1)}
         assigned.append(
             PlaceObservation(place.position, place.turntable_angle_rad, place.stripes, lines, place.placement)
         )
@@ -175,26 +179,37 @@ def _assignment(
     return Assignment(tuple(assigned), left_out, best.motion, decided_by, figures, stripe_pairs)
 
 
-def _whole(place: PlaceFeatures, candidate: Candidate, key: int) -> ScanLine:
-    """The scan line of a panel with the pieces that detection may have split off it."""
-    chosen = place.lines[candidate.lines[key]]
-    fit = candidate.fits[key]
-    length = float(np.ptp(candidate.stripes.extents_m[key]))
-    pieces = [chosen]
-    for k, other in enumerate(place.lines):
-        if k in candidate.lines:
-            continue
-        points = other.points_lidar()
-        along = (points - fit.middle) @ fit.line.direction
-        near = np.abs(fit.line.distance(points)) < 4.0 * np.hypot(other.sigma_m, fit.direction_sigma_rad * along)
-        if near.mean() > 0.9 and np.ptp(np.concatenate([along, (fit.ends - fit.middle) @ fit.line.direction])) < length:
-            pieces.append(other)
-    if len(pieces) == 1:
-        return chosen
-    return _joined(pieces)
+def _pieces(places: Sequence[PlaceFeatures], chosen: Mapping[int, Candidate]) -> dict[tuple[int, int], list[ScanLine]]:
+    """By place and panel, the pieces that detection may have split off the chosen scan line."""
+    others = [
+        (k, line) for k, c in chosen.items() for j, line in enumerate(places[k].lines) if j not in c.lines and len(line)
+    ]
+    found: dict[tuple[int, int], list[ScanLine]] = {}
+    if not others:
+        return found
+    count = np.array([len(line) for _, line in others])
+    start = np.concatenate([[0], np.cumsum(count)[:-1]])
+    points = polar_to_points(*(np.concatenate([getattr(o, n) for _, o in others]) for n in ("angle_rad", "range_m")))
+    sigma = np.concatenate([line.sigma_m for _, line in others])
+    for key in (0, 1):
+        fits = FittedLines.of([chosen[k].fits[key] for k, _ in others])
+        reach = np.array([np.ptp(chosen[k].stripes.extents_m[key]) for k, _ in others])
+        normal, direction, middle = (np.repeat(a, count, axis=0) for a in (fits.normal, fits.direction, fits.middle))
+        offset, turn = (np.repeat(a, count) for a in (fits.offset, fits.direction_sigma_rad))
+        along = ((points - middle) * direction).sum(axis=1)
+        near = np.abs((points * normal).sum(axis=1) - offset) < 4.0 * np.hypot(sigma, turn * along)
+        ends = ((fits.ends - fits.middle[:, None]) @ fits.direction[:, :, None])[..., 0]
+        low = np.minimum(np.minimum.reduceat(along, start), ends.min(axis=1))
+        high = np.maximum(np.maximum.reduceat(along, start), ends.max(axis=1))
+        of_it = (np.add.reduceat(near.astype(np.float64), start) > 0.9 * count) & (high - low < reach)
+        for k in np.flatnonzero(of_it).tolist():
+            found.setdefault((others[k][0], key), []).append(others[k][1])
+    return found
 
 
 def _joined(pieces: list[ScanLine]) -> ScanLine:
+    if len(pieces) == 1:
+        return pieces[0]
     angle = np.concatenate([p.angle_rad for p in pieces])
     order = np.argsort(angle, kind="stable")
     intensity = None

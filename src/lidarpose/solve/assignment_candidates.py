@@ -14,7 +14,14 @@ from lidarpose.geometry.robust import median
 from lidarpose.geometry.se3 import UncertainPose
 from lidarpose.model.camera import Camera
 from lidarpose.model.observation import PlaceFeatures, ScanLine, StripePoints
-from lidarpose.solve.light_plane import StripeOnPanel, StripePair, fit_light_planes, stripe_pair, stripes_on_panel
+from lidarpose.solve.light_plane import (
+    LightPlane,
+    StripeOnPanel,
+    StripePair,
+    fit_light_planes,
+    stripe_pairs,
+    stripes_on_panel,
+)
 from lidarpose.solve.line_pair import FittedLine, FittedLines, fit_line_pairs, fit_scan_lines, leaving_directions
 from lidarpose.solve.panel_pose import PanelPose
 from lidarpose.solve.single_pose import single_poses
@@ -99,14 +106,18 @@ def _stripe_pairs(
     """Light plane and stripes by the place's index; where there are none, the reason is added to `reasons`."""
     found: dict[int, StripePair] = {}
     lit = list(on_panels)
+    lights: dict[int, LightPlane] = {}
     for k, light in zip(lit, fit_light_planes([on_panels[k] for k in lit]), strict=True):
-        first, second = planes[places[k].placement][:2]
-        try:
-            if isinstance(light, ValueError):
-                raise light
-            found[k] = stripe_pair((first, second), on_panels[k], light)
-        except ValueError as reason:
-            reasons[k] = str(reason)
+        if isinstance(light, ValueError):
+            reasons[k] = str(light)
+        else:
+            lights[k] = light
+    both = [(planes[places[k].placement][0], planes[places[k].placement][1]) for k in lights]
+    for k, pair in zip(lights, stripe_pairs(both, [on_panels[k] for k in lights], list(lights.values())), strict=True):
+        if isinstance(pair, ValueError):
+            reasons[k] = str(pair)
+        else:
+            found[k] = pair
     for k, place in enumerate(places):
         if k not in on_panels:
             missing = next(key for key in (0, 1) if not _has_stripe(place, key))

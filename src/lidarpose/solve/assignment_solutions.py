@@ -53,13 +53,19 @@ def solutions_of(pool: Pool) -> list[Solution]:
         starts.add(chosen.tobytes())
         _add(found, _refined(pool, chosen, start))
     for solution in found:
-        _add(found, _refined(pool, _exchanged(pool, solution.chosen), rechoose=False))
+        exchanged = _exchanged(pool, solution.chosen)
+        if not _is_among(found, exchanged):
+            _add(found, _refined(pool, exchanged, rechoose=False))
     return sorted(found, key=lambda s: _score(s.misfit))
 
 
 def _add(found: list[Solution], solution: Solution | None) -> None:
-    if solution is not None and not any(np.array_equal(s.chosen, solution.chosen) for s in found):
+    if solution is not None and not _is_among(found, solution.chosen):
         found.append(solution)
+
+
+def _is_among(found: list[Solution], chosen: IntArray) -> bool:
+    return any(np.array_equal(s.chosen, chosen) for s in found)
 
 
 def is_same(a: Solution, b: Solution) -> bool:
