@@ -381,6 +381,12 @@ def own_turns(fit: CornerFit) -> dict[int, tuple[float, float]]:
     return found
 
 
+def corner_covariances(fit: CornerFit) -> FloatArray:
+    """Covariances (P, 3, 3) of the places' corners in the LiDAR frame."""
+    J = _corner_jacobians(fit.state, fit.world, fit.state.corners(fit.world), fit.options)
+    return np.asarray(J @ fit.covariance @ J.transpose(0, 2, 1))
+
+
 def without_world_noise(fit: CornerFit) -> tuple[FloatArray, FloatArray, int]:
     """Normal equations at the joint estimate with the world's coordinates as they are given, their errors free.
 
@@ -403,22 +409,18 @@ def estimate_world_sigma(fit: CornerFit) -> tuple[float, float]:
     Parameters
     ----------
     fit
-        The joint estimate that took them for exact.
+        The joint estimate that took them for exact, or one that left them free where that fits too few returns.
 
     Returns
     -------
     The standard deviation in metres (0 where nothing speaks against exact ones), and twice the gain in log likelihood.
     """
-    options = CornerOptions(1.0, "log_scale" in fit.names)
-    state = replace(fit.state, world_errors=np.zeros_like(fit.world))
-    information, gradient = _joined(fit.systems, state, fit.world, options)
-    errors = _columns(len(fit.world), options)[1]
-    size = len(gradient) - errors
+    information, gradient, errors = without_world_noise(fit)
     # Of the errors alone, all else being free, along axes on which they are independent.
     solved = np.linalg.solve(
         information[:errors, :errors], np.column_stack([information[:errors, errors:], gradient[:errors]])
     )
-    own = information[errors:, errors:] - np.eye(size) - information[errors:, :errors] @ solved[:, :-1]
+    own = information[errors:, errors:] - information[errors:, :errors] @ solved[:, :-1]
     sureness, axes = np.linalg.eigh(0.5 * (own + own.T))
     along = (axes.T @ (gradient[errors:] - information[errors:, :errors] @ solved[:, -1])) ** 2
     grid = np.geomspace(1e-5, 0.5, 60)

@@ -17,12 +17,11 @@ from lidarpose.model.corner_session import CloudFrame
 from lidarpose.model.observation import LeftOut
 from lidarpose.refine.beam_crossing import MAKERS_CROSSING_M, OpenCrossing, SeenCrossing
 from lidarpose.refine.corner_model import CornerFit
+from lidarpose.refine.slipped_place import TURN_DEG, TURN_STATISTIC
 from lidarpose.refine.spot_scatter import SpotScatter, common_error_factor
 from lidarpose.refine.wrong_coordinate import WrongCoordinate
 
-# A turn of the target: far beyond chance (three degrees of freedom, six where a place stands by itself) and large
-# enough to matter.
-TURN_STATISTIC, TURN_DEG = 30.0, 0.2
+# A turn of the target where a place stands by itself: far beyond chance (six degrees of freedom).
 OWN_TURN_STATISTIC, OWN_TURN_DEG = 60.0, 0.3
 # World coordinates that disagree by more than this with one another are no measurement.
 WORLD_SIGMA_DOUBTFUL_MM = 10.0
@@ -187,6 +186,7 @@ def judge_corners(
     figures["corner_rms_mm"] = 1e3 * float(np.sqrt((residual**2).sum(axis=1).mean()))
     figures["places_used"] = len(world)
     _judge_common(verdict, T_world_lidar, world, lidar, figures, evidence, limits)
+    _judge_single_places(verdict, world, lidar, evidence)
     if figures["corner_rms_mm"] > 30.0:
         verdict.doubt(f"the corners miss their world coordinates by {figures['corner_rms_mm']:.0f} mm RMS")
     return Quality(verdict.verdict, tuple(verdict.reasons), figures)
@@ -227,7 +227,6 @@ def _judge_common(
     _judge_handedness(verdict, pose, world, lidar, evidence)
     _judge_swaps(verdict, pose, world, lidar, evidence)
     _judge_scale(verdict, pose, world, lidar)
-    _judge_single_places(verdict, world, lidar, evidence)
     rotation, position = figures["sigma_rotation_deg"], figures["sigma_position_mm"]
     layout = _layout_remark(world)
     if not (rotation <= 10.0 * limits.want_deg and position <= 10.0 * limits.want_mm):
@@ -366,10 +365,11 @@ def _judge_world(
                 f"the world coordinates of {name} are off by {errors_mm[worst]:.1f} mm, far more than the "
                 f"{1e3 * evidence.stated_world_sigma_m:.1f} mm stated"
             )
-    elif 1e3 * fit.world_sigma_m > WORLD_SIGMA_DOUBTFUL_MM:
+    elif 1e3 * fit.world_sigma_m > WORLD_SIGMA_DOUBTFUL_MM or verdict.verdict != "good":
+        # Good to the precision asked for, nobody asks why it is no better.
         verdict.doubt(
-            f"world coordinates and clouds disagree by {1e3 * fit.world_sigma_m:.0f} mm a coordinate, most at {name} "
-            f"({errors_mm[worst]:.0f} mm)"
+            f"world coordinates and clouds disagree by {1e3 * fit.world_sigma_m:.2g} mm a coordinate, most at {name} "
+            f"({errors_mm[worst]:.2g} mm)"
         )
 
 

@@ -228,12 +228,12 @@ def _found(
         for here, k, order in zip(candidates, best.choice, best.orders, strict=True)
     )
     strays = {
-        k: _stray_in_words(session, world, k, stray) for k, stray in nearest_strays(candidates, best, world).items()
+        k: stray_in_words(session, world, k, stray) for k, stray in nearest_strays(candidates, best, world).items()
     }
     return FoundTarget(sightings, best, world, oddity, _is_ambiguous(matches, world), strays)
 
 
-def _stray_in_words(session: CornerSession, world: FloatArray, place: int, stray: Stray) -> str:
+def stray_in_words(session: CornerSession, world: FloatArray, place: int, stray: Stray) -> str:
     """What is wrong with a place whose target stands elsewhere, or turned."""
     if stray.turned_rad >= SAME_ORIENTATION_RAD:
         return (

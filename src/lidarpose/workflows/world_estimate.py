@@ -27,6 +27,7 @@ from lidarpose.refine.ring_offsets import (
     ring_offsets,
     some_returns,
 )
+from lidarpose.refine.slipped_place import free_fit, loses_returns
 from lidarpose.refine.spot_scatter import common_error_factor
 
 # Offsets of rings, and how much else spots err together, are estimated in turn.
@@ -35,6 +36,8 @@ RING_STEPS = 3
 CROSSING_STEPS = 3
 # Twice the gain in log likelihood at which uncertain world coordinates are believed in.
 CONVINCING_GAIN = 9.0
+# It is estimated again until it grows no more: coordinates taken for better than they are bend the estimate.
+WORLD_STEPS, GROWN = 4, 1.2
 
 
 def fit_places(
@@ -58,11 +61,25 @@ def fit_places(
     stated = session.world_sigma_m
     fit = fit_corner_model(used, start, sigma_m, CornerOptions(stated or 0.0, scale_too), settled=settled, near=near)
     if stated is None:
-        estimated, gain = estimate_world_sigma(fit)
-        if gain > CONVINCING_GAIN:
-            options = CornerOptions(estimated, scale_too)
-            fit = fit_corner_model(used, fit.state, fit.range_sigma_m, options, settled=settled)
+        fit = _with_world_noise(used, fit, settled)
     return fit, used
+
+
+def _with_world_noise(used: Sequence[CornerPlaceFaces], exact: CornerFit, settled: float) -> CornerFit:
+    """The estimate with the world's coordinates as uncertain as the data show them; itself where they fit."""
+    # What does not fit exact coordinates has no say in whether they are.
+    fit = (free_fit(used, exact, settled) if loses_returns(exact, used) else None) or exact
+    known = 0.0
+    for _ in range(WORLD_STEPS):
+        estimated, gain = estimate_world_sigma(fit)
+        if gain < CONVINCING_GAIN:
+            return exact
+        if estimated < GROWN * known:
+            break
+        known = estimated
+        options = CornerOptions(estimated, exact.options.estimate_scale)
+        fit = fit_corner_model(used, fit.state, fit.range_sigma_m, options, settled=settled)
+    return fit
 
 
 @dataclass(frozen=True, eq=False)

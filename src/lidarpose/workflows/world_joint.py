@@ -25,11 +25,12 @@ from lidarpose.refine.face_rims import without_rims
 from lidarpose.refine.face_systems import MIN_RETURNS, MIN_SIGMA_M
 from lidarpose.refine.frame_corners import PlaceFrames
 from lidarpose.refine.free_corner import FreeCorner
+from lidarpose.refine.slipped_place import free_fit, loses_returns, slipped_place
 from lidarpose.refine.spot_scatter import common_error_factor, spot_scatter, weighed_by_angle
 from lidarpose.refine.wrong_coordinate import unsure_noise, wrong_coordinate
 from lidarpose.solve.corner_alignment import svd_pose
-from lidarpose.solve.corner_matching import face_order
-from lidarpose.workflows.corner_target import FoundTarget, PlaceCrop, fit_place, observe, observe_inner
+from lidarpose.solve.corner_matching import Stray, face_order
+from lidarpose.workflows.corner_target import FoundTarget, PlaceCrop, fit_place, observe, observe_inner, stray_in_words
 from lidarpose.workflows.recorded_corners import holds_scans
 from lidarpose.workflows.turntable_share import turntable_share
 from lidarpose.workflows.world_estimate import BesideRings, fit_places, without_rings
@@ -46,6 +47,8 @@ FIRST_RETURNS = 3000
 FIRST_SETTLED = 0.01
 # One step from it leaves next to nothing of so many standard deviations of all returns together.
 FAR_SIGMAS = 60.0
+# Errors of the world's coordinates that large beside the stated standard deviation are a reason to ask why.
+UNLIKELY_SIGMAS = 4.0
 SMALL_TURN_RAD = np.radians(3.0)
 
 
@@ -103,6 +106,9 @@ def joint_estimate(
     first = _first_estimate(mended, found, crops, scale_too, own_fits)
     selected = _selected(mended, found, crops, first)
     fit, used = _whole_estimate(mended, found, first, selected, scale_too)
+    others = _without_slipped_place(mended, found, fit, used)
+    if others is not None:
+        return joint_estimate(session, others, crops, scale_too, limits, own_fits=own_fits)
     beside = without_rings(mended, fit, used)
     return _judged(session, found, first, selected, beside, limits)
 
@@ -178,6 +184,25 @@ def _one_step(first: _First, selected: _Selected) -> CornerFit | None:
         return None
     sigma_m = mad_sigma(np.concatenate(residuals), centred=True, near=first.fit.range_sigma_m)
     return replace(first.fit, state=state, range_sigma_m=max(sigma_m, MIN_SIGMA_M))
+
+
+def _without_slipped_place(
+    mended: CornerSession, found: FoundTarget, fit: CornerFit, used: Sequence[CornerPlaceFaces]
+) -> FoundTarget | None:
+    """The target without a place whose world coordinates alone are plainly wrong; None where none is."""
+    stated = mended.world_sigma_m or 0.0
+    agree = float(np.linalg.norm(fit.state.world_errors, axis=1).max()) <= UNLIKELY_SIGMAS * stated
+    if agree and not loses_returns(fit, used):
+        return None
+    free = free_fit(used, fit, FIRST_SETTLED)
+    slip = None if free is None else slipped_place(free, stated)
+    if slip is None:
+        return None
+    place = [p.position for p in mended.places].index(used[slip.place].position)
+    stray = Stray(found.world[place] + slip.off, slip.off, 0.0, 0.0)
+    sightings = tuple(None if k == place else s for k, s in enumerate(found.sightings))
+    words = {**found.strays, place: stray_in_words(mended, found.world, place, stray)}
+    return replace(found, sightings=sightings, strays=words)
 
 
 def _judged(
