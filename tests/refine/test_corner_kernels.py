@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from lidarpose.geometry.arrays import unit
+from lidarpose.geometry.arrays import IntArray, unit
 from lidarpose.geometry.compiled import forced, installed
-from lidarpose.model.corner_result import FaceReturns
+from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
+from lidarpose.refine.direction_cells import DirectionGrid
+from lidarpose.refine.face_rims import without_rims
 from lidarpose.refine.face_systems import FaceSums, face_sums, loss_factor
 
 pytestmark = pytest.mark.skipif(not installed(), reason="numba is not installed")
@@ -52,3 +54,37 @@ def test_frames_together_are_the_face() -> None:
         parts = face_sums(face, NORMAL, CORNER, SIGMA_M, np.flatnonzero(np.diff(face.frame, prepend=-1))).system
     np.testing.assert_allclose(parts.information, whole.information, rtol=1e-10, atol=1e-6)
     np.testing.assert_allclose(parts.gradient, whole.gradient, rtol=1e-10, atol=1e-6)
+
+
+def test_directions_fall_in_the_same_cells() -> None:
+    rays = np.ascontiguousarray(returns().rays)
+    with forced(False):
+        plain = DirectionGrid.of(rays, np.radians(1.2))
+    with forced(True):
+        compiled = DirectionGrid.of(rays, np.radians(1.2))
+    assert plain.width == compiled.width
+    np.testing.assert_array_equal(plain.cell, compiled.cell)
+    # Neighbours in the grid are neighbours in direction, and a cell is no wider than it should be.
+    for cell in np.unique(plain.cell)[::7]:
+        mine = rays[:, plain.cell == cell]
+        assert np.degrees(np.arccos(np.clip(mine.T @ mine, -1.0, 1.0))).max() < 1.2 * 1.5
+
+
+def test_the_same_rims_are_left_out() -> None:
+    rng = np.random.default_rng(3)
+    corners = np.array([[2.0, 0.0, -0.8], [2.4, 0.5, -0.7], [1.8, -0.4, -0.6]])
+    frame: IntArray = np.zeros(5000, dtype=np.int64)
+    found = []
+    for k, corner in enumerate(corners):
+        flat = corner + np.column_stack([rng.uniform(-0.3, 0.3, (5000, 2)), np.zeros(5000)])
+        to_face = np.linalg.norm(flat, axis=1)
+        below = 2.0 * np.maximum(np.abs(flat - corner)[:, :2].max(axis=1) - 0.29, 0.0)
+        face = FaceReturns(flat / to_face[:, None], to_face + below + 0.008 * rng.standard_normal(5000), frame)
+        found.append(CornerPlaceFaces(str(k), corner, {0: face}, 1))
+    left = []
+    for way in (False, True):
+        with forced(way):
+            left.append(without_rims(found, np.eye(3)[[2, 0, 1]], corners, SIGMA_M))
+    for before, plain, compiled in zip(found, *left, strict=True):
+        np.testing.assert_array_equal(plain.faces[0].range_m, compiled.faces[0].range_m)
+        assert 4000 < len(plain.faces[0]) < 0.97 * len(before.faces[0])

@@ -17,6 +17,10 @@ from lidarpose.geometry.compiled import kernel
 _BLOCK = 256
 
 
+# Beams that are asked together.
+BLOCK = 512
+
+
 @kernel
 def _flagged(flat: Any, start: int, count: int, middle: Any, half: Any, flags: Any) -> Any:
     """Flag those of the first `count` points, x, y, z after one another from a start, that are in a box; how many."""
@@ -158,6 +162,47 @@ def left_alone(
 
 
 @kernel
+def first_met(
+    x: Any, y: Any, z: Any, normals: Any, heights: Any, convex: bool, size: int, face: Any, reach: Any
+) -> None:
+    """The face that each of `size` beams meets first of a convex corner's planes, last of a concave one's, and where;
+    inf where it meets none."""
+    sign = 1.0 if convex else -1.0
+    h0, h1, h2 = sign * heights[0], sign * heights[1], sign * heights[2]
+    a0, a1, a2 = normals[0, 0], normals[0, 1], normals[0, 2]
+    b0, b1, b2 = normals[1, 0], normals[1, 1], normals[1, 2]
+    c0, c1, c2 = normals[2, 0], normals[2, 1], normals[2, 2]
+    for i in range(size):
+        u = a0 * x[i] + a1 * y[i] + a2 * z[i]
+        v = b0 * x[i] + b1 * y[i] + b2 * z[i]
+        w = c0 * x[i] + c1 * y[i] + c2 * z[i]
+        best = h0 / u if u < -0.02 else -np.inf
+        second = h1 / v if v < -0.02 else -np.inf
+        third = h2 / w if w < -0.02 else -np.inf
+        met = 1 if second > best else 0
+        best = second if second > best else best
+        met = 2 if third > best else met
+        best = third if third > best else best
+        # Whoever leaves one of a convex corner's planes behind never enters the solid.
+        away = max(max(u, v), w) >= -0.02
+        reach[i] = np.inf if convex and away else sign * best
+        face[i] = met
+
+
+@kernel
+def far_inside(points: Any, inward: Any, least: Any, begin: int, end: int) -> Any:
+    """By how much (N,) points (3, N) lie inside the nearest of some edges: below 0 outside."""
+    x, y, z = points[0], points[1], points[2]
+    inside = np.full(len(x), np.inf)
+    for e in range(begin, end):
+        a, b, c, start = inward[e, 0], inward[e, 1], inward[e, 2], least[e]
+        for i in range(len(x)):
+            along = a * x[i] + b * y[i] + c * z[i] - start
+            inside[i] = along if along < inside[i] else inside[i]
+    return inside
+
+
+@kernel
 def faces_met(
     rays: Any,
     range_m: Any,
@@ -191,40 +236,45 @@ def faces_met(
     """
     x, y, z = rays[0], rays[1], rays[2]
     found = np.full(len(range_m), -1, np.int8)
-    reach = np.empty(3)
-    slope = np.empty(3)
-    for i in range(len(range_m)):
-        facing = 0
-        for k in range(3):
-            slope[k] = normals[k, 0] * x[i] + normals[k, 1] * y[i] + normals[k, 2] * z[i]
-            if slope[k] < -0.02:
-                facing += 1
-                reach[k] = heights[k] / slope[k]
-            else:
-                reach[k] = -np.inf if convex else np.inf
-        face = 0
-        for k in range(1, 3):
-            if (reach[k] > reach[face]) if convex else (reach[k] < reach[face]):
-                face = k
-        expected = reach[face]
-        # Whoever leaves one of a convex corner's planes behind never enters the solid.
-        if (convex and facing < 3) or not abs(range_m[i] - expected) < gate_m:
-            continue
-        px, py, pz = x[i] * expected, y[i] * expected, z[i] * expected
-        good = True
-        for e in range(starts[face], starts[face + 1]):
-            if not inward[e, 0] * px + inward[e, 1] * py + inward[e, 2] * pz > least[e]:
-                good = False
-                break
-        if not good:
-            continue
-        for k in range(3):
-            if k != face and not abs(slope[k] * expected - heights[k]) > margins_m[face, k]:
-                good = False
-        for b in range(len(obstacles)):
-            off = obstacles[b, 0] * px + obstacles[b, 1] * py + obstacles[b, 2] * pz - obstacles[b, 3]
-            if not off > gaps_m[face, b]:
-                good = False
-        if good:
-            found[i] = face
+    # Everything is asked of many beams at a time, which vector instructions do together.
+    first, reach = np.empty(BLOCK, np.int64), np.empty(BLOCK)
+    point, who = np.empty((3, 3, BLOCK)), np.empty((3, BLOCK), np.int64)
+    many = np.zeros(3, np.int64)
+    for begin in range(0, len(range_m), BLOCK):
+        size = min(BLOCK, len(range_m) - begin)
+        first_met(x[begin:], y[begin:], z[begin:], normals, heights, convex, size, first, reach)
+        many[:] = 0
+        for k in range(size):
+            i, expected, face = begin + k, reach[k], first[k]
+            if not abs(range_m[i] - expected) < gate_m:
+                continue
+            px, py, pz = x[i] * expected, y[i] * expected, z[i] * expected
+            good = True
+            for other in range(3):
+                slope = normals[other, 0] * x[i] + normals[other, 1] * y[i] + normals[other, 2] * z[i]
+                good &= other == face or abs(slope * expected - heights[other]) > margins_m[face, other]
+            for b in range(len(obstacles)):
+                off = obstacles[b, 0] * px + obstacles[b, 1] * py + obstacles[b, 2] * pz - obstacles[b, 3]
+                good &= off > gaps_m[face, b]
+            at = many[face]
+            point[face, 0, at], point[face, 1, at], point[face, 2, at] = px, py, pz
+            who[face, at] = i
+            many[face] += good
+        for face in range(3):
+            inside = far_inside(point[face, :, : many[face]], inward, least, starts[face], starts[face + 1])
+            for at in range(many[face]):
+                if inside[at] > 0.0:
+                    found[who[face, at]] = face
     return found
+
+
+@kernel
+def outside(rays: Any, normal: Any, height: float, inward: Any, least: Any) -> Any:
+    """Which rays (3, N) to a plane meet it outside of an outline's edges, or on them."""
+    x, y, z = rays[0], rays[1], rays[2]
+    a, b, c = normal[0], normal[1], normal[2]
+    points = np.empty((3, len(x)))
+    for i in range(len(x)):
+        reach = height / (a * x[i] + b * y[i] + c * z[i])
+        points[0, i], points[1, i], points[2, i] = x[i] * reach, y[i] * reach, z[i] * reach
+    return far_inside(points, inward, least, 0, len(least)) <= 0.0

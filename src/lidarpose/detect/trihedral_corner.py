@@ -353,6 +353,10 @@ class FaceMask:
         """Which rays (3, N) to a face pass outside its outline, within its rim."""
         normal = self.normals[face]
         inward, least = self._edges_of[face]
+        if pays(0.1 * SAVED_S_PER_BEAM * rays.shape[1], "detect.target_kernels"):
+            from lidarpose.detect.target_kernels import outside
+
+            return np.asarray(outside(rays, normal, normal @ self.corner, inward, least))
         return np.asarray((inward @ (rays * ((normal @ self.corner) / (normal @ rays))) <= least[:, None]).any(axis=0))
 
     @cached_property

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from lidarpose.geometry.compiled import summing_kernel
+import numpy as np
+
+from lidarpose.geometry.compiled import kernel, summing_kernel
 
 
 @summing_kernel
@@ -84,3 +86,97 @@ def loss_powers(residual: Any, reach_m: float) -> Any:
         fourth += v2 * v2
         fifth += v2 * v2 * v
     return first, second, fourth, fifth
+
+
+@kernel
+def grid_cells(rays: Any, axes: Any, scale: float) -> Any:
+    """The cell (N,) of a grid of angles that each ray (3, N) is in, and the grid's width; see `DirectionGrid`."""
+    x, y, z = rays[0], rays[1], rays[2]
+    count = len(x)
+    row, column = np.empty(count), np.empty(count)
+    a0, a1, a2 = axes[0, 0], axes[0, 1], axes[0, 2]
+    b0, b1, b2 = axes[1, 0], axes[1, 1], axes[1, 2]
+    c0, c1, c2 = axes[2, 0], axes[2, 1], axes[2, 2]
+    least_row, least_column, most_column = np.inf, np.inf, -np.inf
+    for i in range(count):
+        ahead = 1.0 + (a0 * x[i] + a1 * y[i] + a2 * z[i])
+        share = scale / (ahead if ahead > 1e-12 else 1e-12)
+        u = (b0 * x[i] + b1 * y[i] + b2 * z[i]) * share
+        v = (c0 * x[i] + c1 * y[i] + c2 * z[i]) * share
+        row[i], column[i] = u, v
+        least_row = u if u < least_row else least_row
+        least_column = v if v < least_column else least_column
+        most_column = v if v > most_column else most_column
+    first_row, first_column = np.floor(least_row), np.floor(least_column)
+    width = np.int64(most_column - first_column) + 3
+    cell = np.empty(count, np.int64)
+    for i in range(count):
+        cell[i] = (np.int64(row[i] - first_row) + 1) * width + np.int64(column[i] - first_column) + 1
+    return cell, width
+
+
+@kernel
+def met_at(rays: Any, range_m: Any, axes: Any, along: Any, u: Any, v: Any, residual: Any) -> None:
+    """Where rays (3, N) meet a plane, along its tangents (N,) from the corner, and measured minus expected ranges (N,).
+
+    `axes` (3, 3) are the plane's normal and tangents, `along` (3,) the corner along them.
+    """
+    x, y, z = rays[0], rays[1], rays[2]
+    nx, ny, nz = axes[0, 0], axes[0, 1], axes[0, 2]
+    ux, uy, uz = axes[1, 0], axes[1, 1], axes[1, 2]
+    vx, vy, vz = axes[2, 0], axes[2, 1], axes[2, 2]
+    height, at_u, at_v = along[0], along[1], along[2]
+    for i in range(len(x)):
+        expected = height / (nx * x[i] + ny * y[i] + nz * z[i])
+        u[i] = (ux * x[i] + uy * y[i] + uz * z[i]) * expected - at_u
+        v[i] = (vx * x[i] + vy * y[i] + vz * z[i]) * expected - at_v
+        residual[i] = range_m[i] - expected
+
+
+@kernel
+def reaches(points: Any, directions: Any, starts: Any) -> Any:
+    """By part of points (2, N), which begin at `starts` (P + 1,): how far they reach along and against directions
+    (D, 2), both (P, D)."""
+    cosine, sine = directions[:, 0].copy(), directions[:, 1].copy()
+    most = np.full((len(starts) - 1, len(cosine)), -np.inf)
+    least = np.full((len(starts) - 1, len(cosine)), np.inf)
+    for part in range(len(most)):
+        high, low = most[part], least[part]
+        for i in range(starts[part], starts[part + 1]):
+            x, y = points[0, i], points[1, i]
+            for k in range(len(cosine)):
+                out = cosine[k] * x + sine[k] * y
+                high[k] = out if out > high[k] else high[k]
+                low[k] = out if out < low[k] else low[k]
+    return most, least
+
+
+@kernel
+def within(points: Any, directions: Any, least: Any, most: Any) -> Any:
+    """Which of points (2, N) lie between two bounds (D,) along all directions (D, 2)."""
+    inside = np.ones(points.shape[1], np.bool_)
+    x, y = points[0], points[1]
+    for k in range(len(directions)):
+        cosine, sine, low, high = directions[k, 0], directions[k, 1], least[k], most[k]
+        for i in range(len(inside)):
+            out = cosine * x[i] + sine * y[i]
+            inside[i] &= (out >= low) & (out <= high)
+    return inside
+
+
+@kernel
+def farthest_out(points: Any, directions: Any) -> Any:
+    """Which (2 D,) of points (2, N), the first of equals, is farthest along each of directions (D, 2); then against."""
+    many = len(directions)
+    cosine, sine = directions[:, 0].copy(), directions[:, 1].copy()
+    most, least = np.full(many, -np.inf), np.full(many, np.inf)
+    index = np.zeros(2 * many, np.int64)
+    for i in range(points.shape[1]):
+        x, y = points[0, i], points[1, i]
+        for k in range(many):
+            out = cosine[k] * x + sine[k] * y
+            index[k] = i if out > most[k] else index[k]
+            most[k] = out if out > most[k] else most[k]
+            index[many + k] = i if out < least[k] else index[many + k]
+            least[k] = out if out < least[k] else least[k]
+    return index

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, unit
+from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.threads import each
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.refine.face_systems import tangents
@@ -34,12 +35,18 @@ MOST_GRAZING, GUARD_SHARE = 0.2, 0.1
 # Of a lone scan line nothing is tested, and a face's few returns are no face.
 THINNEST_M, FEWEST_RETURNS = 0.01, 8
 OUTLINE_DIRECTIONS = 128
-MOST_FOR_OUTLINE = 8000
+MOST_FOR_OUTLINE = 4000
 # Sides shorter than this share of the face are rounding of its outline; two this alike in direction are one.
 SIDE_SHARE = 0.15
 SAME_SIDE_COS = np.cos(np.radians(20.0))
 # Where two faces meet, their edge is known by their planes.
 SEAM_M, SEAM_COS = 0.03, 0.9
+# By how much kernels are done sooner, on one core.
+SAVED_S_PER_RETURN, KERNELS = 1e-8, "refine.corner_kernels"
+
+# Half of the directions (D, 2): the others are their opposites.
+_ANGLES = np.arange(OUTLINE_DIRECTIONS // 2) * (2.0 * np.pi / OUTLINE_DIRECTIONS)
+_ROUND = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,15 +130,37 @@ def _kept(returns: FaceReturns, mine: BoolArray) -> FaceReturns | None:
 def _face(
     returns: Sequence[FaceReturns], normal: FloatArray, axes: FloatArray, corners: FloatArray, sigma_m: float
 ) -> _Face:
-    points, residuals = [], []
-    for f, corner in zip(returns, corners, strict=True):
-        expected = (normal @ corner) / (normal @ f.rays)
-        points.append((axes @ f.rays) * expected - (axes @ corner)[:, None])
-        residuals.append(f.range_m - expected)
-    residual = np.clip(np.concatenate(residuals) / sigma_m, -CLIP_SIGMAS, CLIP_SIGMAS)
+    count = [len(f) for f in returns]
+    points, residual = np.empty((2, sum(count))), np.empty(sum(count))
+    ends = np.cumsum(count)
+    compiled = pays(SAVED_S_PER_RETURN * len(residual), KERNELS)
+    for f, corner, begin, end in zip(returns, corners, ends - count, ends, strict=True):
+        put = _met_compiled if compiled else _met
+        put(f, np.vstack([normal, axes]), corner, points[:, begin:end], residual[begin:end])
+    residual *= 1.0 / sigma_m
+    np.clip(residual, -CLIP_SIGMAS, CLIP_SIGMAS, out=residual)
     distance = np.linalg.norm(corners, axis=1)
-    place = np.repeat(np.arange(len(returns)), [len(f) for f in returns])
-    return _Face(np.concatenate(points, axis=1), residual, place, corners @ axes.T / distance[:, None], distance)
+    place = np.repeat(np.arange(len(returns)), count)
+    return _Face(points, residual, place, corners @ axes.T / distance[:, None], distance)
+
+
+def _met(returns: FaceReturns, axes: FloatArray, corner: FloatArray, points: FloatArray, residual: FloatArray) -> None:
+    """Where a place's rays meet the face (2, N), in its plane from the corner, and measured minus expected ranges (N,);
+    `axes` (3, 3) are its normal and two tangents."""
+    along, at = axes @ returns.rays, axes @ corner
+    expected = at[0] / along[0]
+    np.multiply(along[1:], expected, out=points)
+    points -= at[1:, None]
+    np.subtract(returns.range_m, expected, out=residual)
+
+
+def _met_compiled(
+    returns: FaceReturns, axes: FloatArray, corner: FloatArray, points: FloatArray, residual: FloatArray
+) -> None:
+    from lidarpose.refine.corner_kernels import met_at
+
+    range_m = np.ascontiguousarray(returns.range_m, dtype=np.float64)
+    met_at(returns.rays, range_m, axes, axes @ corner, points[0], points[1], residual)
 
 
 def _sides(face: _Face, seams: FloatArray) -> list[_Side]:
@@ -158,22 +187,25 @@ def _common_part(face: _Face) -> tuple[FloatArray, FloatArray]:
     Where the ground lies 2 cm below a face, a single place may show it as the face's own.
     """
     step = max(len(face.place) // MOST_FOR_OUTLINE, 1)
-    points, place = face.points[:, ::step], face.place[::step]
-    # Half of the directions: the others are their opposites. Single precision tells a micrometre.
-    angle = np.arange(OUTLINE_DIRECTIONS // 2) * (2.0 * np.pi / OUTLINE_DIRECTIONS)
-    along = np.column_stack([np.cos(angle), np.sin(angle)]).astype(np.float32)
-    out = along @ points.astype(np.float32)
+    points, place = np.ascontiguousarray(face.points[:, ::step]), face.place[::step]
     begins = np.flatnonzero(np.diff(place, prepend=-1))
-    most, least = (np.median(ends.reduceat(out, begins, axis=1), axis=1) for ends in (np.maximum, np.minimum))
-    beyond = out > most[:, None] + 1e-6
-    beyond |= out < least[:, None] - 1e-6
-    near = np.flatnonzero(~beyond.any(axis=0))
-    if FEWEST_RETURNS < near.size < place.size:
-        points = points.take(near, axis=1)
-        # Into the same memory: as much again would have to be had from the system first.
-        again = out.ravel()[: len(along) * near.size].reshape(len(along), near.size)
-        out = np.matmul(along, points.astype(np.float32), out=again)
-    outermost = np.concatenate([out.argmax(axis=1), out.argmin(axis=1)])
+    if pays(10.0 * SAVED_S_PER_RETURN * len(place), KERNELS):
+        from lidarpose.refine.corner_kernels import farthest_out, reaches, within
+
+        most, least = (np.median(ends, axis=0) for ends in reaches(points, _ROUND, np.append(begins, len(place))))
+        near = np.flatnonzero(within(points, _ROUND, least - 1e-6, most + 1e-6))
+        if FEWEST_RETURNS < near.size < place.size:
+            points = points.take(near, axis=1)
+        outermost = farthest_out(points, _ROUND)
+    else:
+        out = _ROUND @ points
+        most, least = (np.median(ends.reduceat(out, begins, axis=1), axis=1) for ends in (np.maximum, np.minimum))
+        beyond = out > most[:, None] + 1e-6
+        beyond |= out < least[:, None] - 1e-6
+        near = np.flatnonzero(~beyond.any(axis=0))
+        if FEWEST_RETURNS < near.size < place.size:
+            points, out = points.take(near, axis=1), out.take(near, axis=1)
+        outermost = np.concatenate([out.argmax(axis=1), out.argmin(axis=1)])
     return points, np.asarray(points[:, outermost[outermost != np.roll(outermost, 1)]].T)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.robust import median
 from lidarpose.model.corner_result import FaceReturns
-from lidarpose.refine.direction_cells import direction_grid
+from lidarpose.refine.direction_cells import DirectionGrid
 from lidarpose.refine.face_systems import face_residuals, face_rows
 
 SPOT_RAD = np.radians(1.2)
@@ -48,79 +48,76 @@ def without_foreign_spots(
     -------
     All returns where nothing is foreign, or where the face as a whole is turned: that is for the estimate to say.
     """
-    grid = _Grid.of(returns)
-    spots = None if grid.dense else _spots(returns, grid, normal, corner)
+    seen = _Seen.of(returns, normal, corner)
+    kept = np.arange(len(returns))
+    spots = None if _is_dense(seen) else _spots(seen)
     # Where scan lines lie so close, none is needed outside of the outline to tell where the face ends.
-    if spots is None or _is_rim_odd(spots.residual[rim], sigma_m, spots.spread_m):
-        inner = np.flatnonzero(~rim)
-        if len(inner) == 0:
-            return returns.subset(inner)
-        if len(inner) < len(rim):
-            returns, grid = returns.subset(inner), grid.subset(inner)
-        spots = _spots(returns, grid, normal, corner)
+    if spots is None or _is_rim_odd(seen.residual[rim] - spots.level_m, sigma_m, spots.spread_m):
+        kept = np.flatnonzero(~rim)
+        if len(kept) == 0:
+            return returns.subset(kept)
+        seen = seen if len(kept) == len(rim) else seen.subset(kept)
+        spots = _spots(seen)
     odd = _odd(spots, sigma_m)
-    if not odd.any() or _is_turned(returns, spots, normal, corner, sigma_m):
-        return returns
-    if spots.grid.dense:
-        # What is something else does not end where a spot does.
-        odd |= _sum_around(odd, spots.grid.width) > 0
-    return returns.subset(np.flatnonzero(~odd[spots.grid.cell]))
+    if odd.any() and not _is_turned(returns.subset(kept), seen, spots, normal, corner, sigma_m):
+        if _is_dense(seen):
+            # What is something else does not end where a spot does.
+            odd |= _sum_around(odd, seen.width) > 0
+        kept = kept[~odd[seen.cell]]
+    return returns if len(kept) == len(returns) else returns.subset(kept)
 
 
 @dataclass(frozen=True, eq=False)
-class _Grid:
-    """Which cell (N,) of a grid of directions each return is in, and how many each cell (M,) holds. The grid has a rim
-    of empty cells, its rows of `width` one after the other."""
+class _Seen:
+    """What a face's returns are off by (N,), and how far each lies towards the corner (N,); which cell (N,) of a grid
+    of directions each is in, as of `DirectionGrid`."""
 
+    residual: FloatArray
+    nearness: FloatArray
     cell: IntArray
-    count: IntArray
     width: int
 
     @staticmethod
-    def of(returns: FaceReturns) -> _Grid:
-        row, column = direction_grid(returns.rays, SPOT_RAD)
-        width = int(column.max()) + 3
-        cell = np.asarray((row + 1) * width + column + 1)
-        return _Grid(cell, np.bincount(cell), width)
+    def of(returns: FaceReturns, normal: FloatArray, corner: FloatArray) -> _Seen:
+        grid = DirectionGrid.of(returns.rays, SPOT_RAD)
+        return _Seen(face_residuals(returns, normal, corner), corner @ returns.rays, grid.cell, grid.width)
 
-    def subset(self, index: IntArray) -> _Grid:
-        cell = self.cell[index]
-        return _Grid(cell, np.bincount(cell), self.width)
+    def subset(self, index: IntArray) -> _Seen:
+        return _Seen(self.residual.take(index), self.nearness.take(index), self.cell.take(index), self.width)
 
     @cached_property
-    def dense(self) -> bool:
-        """Whether scan lines lie closer than spots, so that most neighbours of a spot hold returns too."""
-        there = self.count > 0
-        return float(_sum_around(there, self.width)[there].mean()) > DENSE_NEIGHBOURS
+    def count(self) -> IntArray:
+        """How many returns each cell (M,) holds."""
+        return np.bincount(self.cell)
+
+    def means(self, residual: FloatArray) -> FloatArray:
+        """Of each cell (M,)."""
+        return np.asarray(np.bincount(self.cell, residual) / np.maximum(self.count, 1))
 
 
 @dataclass(frozen=True, eq=False)
 class _Spots:
-    """What a face's returns are off by, by themselves and cell by cell.
+    """Cell by cell (M,): the mean of what returns are off by against the level of what is next to the corner, and how
+    many there are; how far spots next to the corner are off, as a standard deviation."""
 
-    Attributes
-    ----------
-    residual : (N,)
-        Against the level of what is next to the corner.
-    mean : (M,)
-        Of each cell.
-    spread_m
-        How far spots next to the corner are off, as a standard deviation.
-    """
-
-    grid: _Grid
-    residual: FloatArray
     mean: FloatArray
+    count: IntArray
+    level_m: float
     spread_m: float
 
 
-def _spots(returns: FaceReturns, grid: _Grid, normal: FloatArray, corner: FloatArray) -> _Spots:
-    residual = face_residuals(returns, normal, corner)
-    sure = _next_to_corner(returns, corner)
-    residual -= median(residual.take(sure))
-    mean = _means(grid, residual)
-    spread_m = _spread(mean, grid.count, np.bincount(grid.cell.take(sure), minlength=len(grid.count)))
-    return _Spots(grid, residual, mean, spread_m)
+def _is_dense(seen: _Seen) -> bool:
+    """Whether scan lines lie closer than spots, so that most neighbours of a spot hold returns too."""
+    there = seen.count > 0
+    return float(_sum_around(there, seen.width)[there].mean()) > DENSE_NEIGHBOURS
+
+
+def _spots(seen: _Seen) -> _Spots:
+    sure = _next_to_corner(seen.nearness)
+    level_m = median(seen.residual.take(sure))
+    mean = np.where(seen.count > 0, seen.means(seen.residual) - level_m, 0.0)
+    spread_m = _spread(mean, seen.count, np.bincount(seen.cell.take(sure), minlength=len(seen.count)))
+    return _Spots(mean, seen.count, level_m, spread_m)
 
 
 def _is_rim_odd(residual: FloatArray, sigma_m: float, spread_m: float) -> bool:
@@ -131,20 +128,18 @@ def _is_rim_odd(residual: FloatArray, sigma_m: float, spread_m: float) -> bool:
     return off > ODD_RIM_SPREADS * spread_m and off * np.sqrt(len(residual)) > ODD_RIM_SIGMAS * sigma_m
 
 
-def _is_turned(returns: FaceReturns, spots: _Spots, normal: FloatArray, corner: FloatArray, sigma_m: float) -> bool:
+def _is_turned(
+    returns: FaceReturns, seen: _Seen, spots: _Spots, normal: FloatArray, corner: FloatArray, sigma_m: float
+) -> bool:
     """Whether a plane of its own explains a face to the noise: then nothing on it is foreign."""
     _, rows = face_rows(returns.rays, normal, corner)
-    own = spots.residual - rows.T @ np.linalg.lstsq(rows.T, spots.residual, rcond=None)[0]
-    return _only_noise(_means(spots.grid, own), spots.grid.count, sigma_m)
+    residual = seen.residual - spots.level_m
+    own = residual - rows.T @ np.linalg.lstsq(rows.T, residual, rcond=None)[0]
+    return _only_noise(seen.means(own), seen.count, sigma_m)
 
 
-def _means(grid: _Grid, residual: FloatArray) -> FloatArray:
-    return np.asarray(np.bincount(grid.cell, residual) / np.maximum(grid.count, 1))
-
-
-def _next_to_corner(returns: FaceReturns, corner: FloatArray) -> IntArray:
+def _next_to_corner(nearness: FloatArray) -> IntArray:
     """Which returns are next to the corner: that they are of the face is surer than where the face is."""
-    nearness = corner @ returns.rays
     rest = int((1.0 - SURE_SHARE) * len(nearness))
     return np.argpartition(nearness, rest)[rest:]
 
@@ -161,7 +156,7 @@ def _spread(mean: FloatArray, count: IntArray, sure: IntArray) -> float:
 def _odd(spots: _Spots, sigma_m: float) -> BoolArray:
     off = np.abs(spots.mean)
     far = off > max(ODD_SPOT_SIGMAS * sigma_m, ODD_SPREADS * spots.spread_m)
-    return np.asarray(far & (off * np.sqrt(spots.grid.count) > ODD_MEAN_SIGMAS * sigma_m))
+    return np.asarray(far & (off * np.sqrt(spots.count) > ODD_MEAN_SIGMAS * sigma_m))
 
 
 def _only_noise(mean: FloatArray, count: IntArray, sigma_m: float) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.refine.corner_model import CornerFit, face_jacobians, reweighted
-from lidarpose.refine.direction_cells import direction_cells
+from lidarpose.refine.direction_cells import DirectionGrid
 from lidarpose.refine.face_systems import face_residuals
 
 CELL_RAD = np.radians(1.5)
@@ -43,14 +43,12 @@ def spot_scatter(fit: CornerFit, places: Sequence[CornerPlaceFaces]) -> dict[tup
         for j, returns in place.faces.items():
             residual = face_residuals(returns, fit.state.normals[j], corners[i])
             keep = np.flatnonzero(np.abs(residual) < 4.0 * fit.range_sigma_m)
-            if len(keep) == 0:
-                # A place whose world coordinates are off by decimetres may stand by itself.
-                found[i, j] = SpotScatter(0.0, 0)
-                continue
-            cell = direction_cells(returns.rays.take(keep, axis=1), CELL_RAD)
+            # None: a place whose world coordinates are off by decimetres may stand by itself.
+            cell = DirectionGrid.of(returns.rays, CELL_RAD).cell.take(keep)
             count = np.bincount(cell)
-            mean = np.bincount(cell, residual.take(keep)) / count
-            found[i, j] = SpotScatter(float((mean**2 * count).sum()) / fit.range_sigma_m**2, len(count))
+            total = np.bincount(cell, residual.take(keep))
+            chi2 = float((total**2 / np.maximum(count, 1)).sum()) / fit.range_sigma_m**2
+            found[i, j] = SpotScatter(chi2, int(np.count_nonzero(count)))
     return found
 
 

@@ -105,16 +105,15 @@ class PlaceCrop:
         return self.rays.T
 
     def thinned(self, most: int) -> PlaceCrop:
-        """About `most` of the points, spread evenly over all frames; all of them where there are hardly more.
+        """`most` of the points, spread evenly over all frames; all of them where there are hardly more.
 
-        The golden ratio's multiples hit no period of the beams' order.
+        One of each stretch of them; the golden ratio's multiples, which say which, hit no period of the beams' order.
         """
         count = len(self.frame)
         if count < 1.5 * most:
             return self
-        turns = np.arange(count) * GOLDEN
-        turns -= np.floor(turns)
-        index = np.flatnonzero(turns < most / count)
+        step = np.arange(most)
+        index = ((step + step * GOLDEN % 1.0) * (count / most)).astype(np.int64)
         return PlaceCrop(self.points[index], self.frame[index], self.frames)
 
 
