@@ -164,7 +164,8 @@ class _Lent(threading.local):
 
     def bytes(self, size: int) -> NDArray[np.uint8]:
         if len(self.memory) < size:
-            self.memory = np.empty(size, dtype=np.uint8)
+            # The next frame may hold a few points more.
+            self.memory = np.empty(size + size // 8, dtype=np.uint8)
         return self.memory[:size]
 
 

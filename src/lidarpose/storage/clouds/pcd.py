@@ -101,6 +101,9 @@ def _row_type(path: Path, entries: dict[str, list[str]]) -> tuple[np.dtype[Any],
             raise InputError(
                 path, f"has {len(values)} entries", field=key, expected=f"one for each of {len(names)} fields"
             )
+    described = (tuple(names), tuple(sizes), tuple(types), tuple(counts))
+    if described in _rows:
+        return _rows[described]
     items: list[tuple[str, str, tuple[int, ...]]] = []
     padding: list[str] = []
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
@@ -114,7 +117,15 @@ def _row_type(path: Path, entries: dict[str, list[str]]) -> tuple[np.dtype[Any],
         if name in (item[0] for item in items):
             raise InputError(path, f"{name} is there twice", field="FIELDS", expected="each name once")
         items.append((name, "<" + code, (elements,) if elements > 1 else ()))
-    return np.dtype(items), tuple(padding)
+    found = np.dtype(items), tuple(padding)
+    if len(_rows) < _MOST_ROWS:
+        _rows[described] = found
+    return found
+
+
+# The frames of a session are alike: what their headers say of a row is made out once.
+_rows: dict[tuple[tuple[str, ...], ...], tuple[np.dtype[Any], tuple[str, ...]]] = {}
+_MOST_ROWS = 64
 
 
 def _point_count(path: Path, entries: dict[str, list[str]]) -> int:
