@@ -41,7 +41,8 @@ KERNELS = "detect.patch_kernels"
 SAVED_S = 1.5e-3
 SAVED_S_PER_POINT = 7e-8
 SAMPLE_SIZE = 4096
-PLANES_AT_ONCE = 16
+# Distances of so many planes are looked at together as fit into a core's own memory.
+DISTANCES_AT_ONCE = 65_536
 # From this many points on, patches are found and tested in a subsample, and the whole cloud is asked once.
 DENSE = 200_000
 DENSE_SAMPLE = 8192
@@ -237,7 +238,7 @@ def _harvest_dense(
         if not _is_thin(np.append(0.0, claim.variances), patch.sigma_m):
             continue
         # Few voxels of the subsample say little of what a patch is: the cloud has more.
-        if len(_one_a_voxel(few[before.indices], GATE_SIGMAS * before.sigma_m)) < ENOUGH_EVIDENCE:
+        if len(first_in_each(few[before.indices], GATE_SIGMAS * before.sigma_m)) < ENOUGH_EVIDENCE:
             local = x[claim.around()].astype(np.float32)
             if not _stands_out(local, patch.plane.normal, patch.plane.offset, patch.sigma_m):
                 continue
@@ -328,12 +329,13 @@ def _near(points: Float32Array, planes: FloatArray, gate_m: float) -> Bits:
     """Which points (S, 3) lie within the gate of which planes (H, 4), in bits (H, W)."""
     near = np.empty((len(planes), -(-len(points) // 64)), dtype=np.uint64)
     rows, columns = planes.astype(np.float32), np.ascontiguousarray(points.T)
-    for first in range(0, len(planes), PLANES_AT_ONCE):
-        some = rows[first : first + PLANES_AT_ONCE]
+    together = max(DISTANCES_AT_ONCE // max(len(points), 1), 1)
+    for first in range(0, len(planes), together):
+        some = rows[first : first + together]
         distance = some[:, :3] @ columns
         distance -= some[:, 3:]
         np.abs(distance, out=distance)
-        near[first : first + PLANES_AT_ONCE] = _bits(distance < np.float32(gate_m))
+        near[first : first + together] = _bits(distance < np.float32(gate_m))
     return near
 
 
@@ -475,9 +477,15 @@ def _best_patch(sample: _Sample, active: BoolArray, votes: Float32Array) -> tupl
 
 def _moment_plane(points: NDArray[np.floating]) -> Plane:
     """Total least squares plane; the normal points to the origin's side."""
-    mean = points.mean(axis=0, dtype=np.float64)
-    d = points - mean.astype(points.dtype)
-    normal = np.linalg.eigh((d.T @ d).astype(np.float64))[1][:, 0]
+    if pays(0.0, KERNELS):
+        from lidarpose.detect.patch_kernels import eigen, mean_and_products
+
+        mean, products = mean_and_products(points)
+        normal = eigen(products)[1][:, 0].copy()
+    else:
+        mean = points.mean(axis=0, dtype=np.float64)
+        d = points - mean.astype(points.dtype)
+        normal = np.linalg.eigh((d.T @ d).astype(np.float64))[1][:, 0]
     offset = float(normal @ mean)
     return Plane(normal, offset) if offset <= 0.0 else Plane(-normal, -offset)
 
@@ -578,7 +586,7 @@ def _stands_out(
     found out here if it is not known.
     """
     points = local[:: max(len(local) // EVIDENCE_POINTS, 1)]
-    points = points[_one_a_voxel(points, GATE_SIGMAS * sigma_m)]
+    points = points[first_in_each(points, GATE_SIGMAS * sigma_m)]
     height = np.abs(points @ normal.astype(np.float32) - np.float32(offset))
     inside = height < GATE_SIGMAS * sigma_m
     around = height < 2.0 * GATE_SIGMAS * sigma_m
@@ -596,7 +604,7 @@ def _neighbours_agree(points: Float32Array, normal: FloatArray, sigma_m: float) 
     two thirds are such, nobody is asked."""
     if len(points) <= SCREENING_NEIGHBOURS:
         return True
-    seeds = points[:: max(len(points) // SCREENED_POINTS, 1)]
+    seeds = points[:: -(-len(points) // SCREENED_POINTS)]
     if pays(0.0, KERNELS):
         from lidarpose.detect.patch_kernels import nearest
 
@@ -613,9 +621,9 @@ def _neighbours_agree(points: Float32Array, normal: FloatArray, sigma_m: float) 
     return _mostly_agree(planes[known, :3], normal)
 
 
-def _one_a_voxel(points: Float32Array, side_m: float) -> IntArray:
+def first_in_each(points: NDArray[np.floating], side_m: float) -> IntArray:
     """The first point (V,) in each cube of the side that holds any of points (M, 3)."""
-    x, y, z = np.floor(points.T / np.float32(side_m)).astype(np.int64)
+    x, y, z = np.floor(points.T / points.dtype.type(side_m)).astype(np.int64)
     y -= y.min()
     z -= z.min()
     cells = (x - x.min()) * (int(y.max()) + 1)

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpose.detect.cloud_planes import PlaneSearch, largest_component, segment_planes
+from lidarpose.detect.cloud_planes import PlaneSearch, first_in_each, largest_component, segment_planes
 from lidarpose.detect.crop import inside_box
 from lidarpose.detect.plane_raster import mean_and_covariance
-from lidarpose.detect.trihedral_corner import KERNELS, FaceMask, corner_of_faces, outline_edges
+from lidarpose.detect.trihedral_corner import (
+    KERNELS,
+    MAX_MISSING_M,
+    MIN_FACE_POINTS,
+    ONE_SIDED,
+    REACH_M,
+    RIM_M,
+    ROUND,
+    FaceMask,
+    corner_of_faces,
+    outline_edges,
+)
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, unit
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.planes import Plane
@@ -36,7 +48,6 @@ AROUND_M = 0.15
 # The same, and the rest of its faces, where its outlines show but a part of them.
 MISSING_M = 0.35
 STANDING_ROUNDS, STANDING_HYPOTHESES, STANDING_VOXEL_M = 2, 150, 0.04
-VOXEL_KEY = np.array([1, 1 << 20, 1 << 40])
 # By how much kernels have a place done sooner.
 SAVED_S_PER_PLACE = 2e-3
 
@@ -49,6 +60,7 @@ class _Edges:
     inward: FloatArray
     least: FloatArray
     starts: IntArray
+    vertices: FloatArray
 
     @staticmethod
     def of(reference: CornerCandidate) -> _Edges:
@@ -57,11 +69,17 @@ class _Edges:
             outline_edges(o - reference.corner, n) for o, n in zip(reference.outlines, reference.normals, strict=True)
         ]
         inward, least = (np.concatenate(parts) for parts in zip(*edges, strict=True))
-        return _Edges(inward, least, np.cumsum([0, *(len(least) for _, least in edges)]))
+        vertices = np.concatenate(reference.outlines) - reference.corner
+        return _Edges(inward, least, np.cumsum([0, *(len(least) for _, least in edges)]), vertices)
 
     def least_at(self, corner: FloatArray, slack_m: float) -> FloatArray:
         """How far along each edge's direction (E,) points lie at least, with the corner here and outlines widened."""
         return np.asarray(self.least + self.inward @ corner - slack_m)
+
+    def by_face_at(self, corner: FloatArray) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """By face, its edges with the corner here."""
+        least = self.least_at(corner, 0.0)
+        return tuple((self.inward[i:j], least[i:j]) for i, j in pairwise(self.starts.tolist()))
 
 
 def corner_of_normals(points: NDArray[np.floating[Any]], normals: FloatArray, sigma_m: float) -> FloatArray:
@@ -182,6 +200,8 @@ def _sighting(
     corner: FloatArray,
 ) -> CornerCandidate | None:
     own = _meeting(planes)
+    if pays(0.0, KERNELS):
+        return _sighting_compiled(local, own, [*planes, *standing], reference, edges, corner)
     everything, local = local, _about(local, reference, own, AROUND_M)
     shown = _over_outlines(local, reference, edges, own, BORDER_M)
     patches = _shared_out(local, [*planes, *standing], shown, reference.sigma_m)
@@ -191,7 +211,60 @@ def _sighting(
     found = corner_of_faces(local, (*patches[:3], *bordering))
     if found is None or found.convex != reference.convex or np.linalg.norm(found.corner - corner) > NEAR_M:
         return None
-    return found if _is_in_view(everything, found, reference) else None
+    return found if _is_in_view(everything, found, reference, edges) else None
+
+
+def _sighting_compiled(
+    local: FloatArray,
+    own: FloatArray,
+    planes: Sequence[Plane],
+    reference: CornerCandidate,
+    edges: _Edges,
+    corner: FloatArray,
+) -> CornerCandidate | None:
+    """`_sighting` by kernels, the target's own corner known."""
+    from lidarpose.detect.sighting_kernels import faces_seen, in_view
+
+    rows = np.array([[*plane.normal, plane.offset] for plane in planes])
+    lengths = np.array([AROUND_M, BORDER_M, REACH_M, MAX_MISSING_M, GATE_SIGMAS * reference.sigma_m])
+    side, outlines, sizes, counts, spreads, borders = faces_seen(
+        local,
+        own,
+        rows,
+        np.ascontiguousarray(reference.normals),
+        edges.vertices,
+        edges.inward,
+        edges.least,
+        edges.starts,
+        lengths,
+        np.array([FEWEST, MIN_FACE_POINTS]),
+        ONE_SIDED,
+        ROUND,
+    )
+    if side != int(reference.convex) or sizes.min() < 3 or np.linalg.norm(own - corner) > NEAR_M:
+        return None
+    sigma_m = float(np.median(spreads[:3]))
+    seen_at = edges.vertices + own
+    least, gate_m = edges.least_at(own, RIM_M), 2.0 * GATE_SIGMAS * sigma_m
+    wanted, there = in_view(
+        local,
+        own,
+        rows[:3],
+        bool(reference.convex),
+        seen_at,
+        edges.inward,
+        least,
+        edges.starts,
+        rows[borders],
+        VIEW_MARGIN_M,
+        MARGIN_M,
+        gate_m,
+    )
+    if not _mostly_ends(wanted, there):
+        return None
+    a, b, c = (outline[:size].copy() for outline, size in zip(outlines, sizes, strict=True))
+    obstacles = tuple(plane for plane, is_one in zip(planes, borders, strict=True) if is_one)
+    return CornerCandidate(own, rows[:3, :3].copy(), reference.convex, (a, b, c), obstacles, int(counts.min()), sigma_m)
 
 
 def _about(points: FloatArray, reference: CornerCandidate, corner: FloatArray, margin_m: float) -> FloatArray:
@@ -295,12 +368,14 @@ def _fitted(local: FloatArray, chosen: IntArray, plane: Plane, sigma_m: float) -
 
 def _standing_planes(rest: FloatArray, seed: int) -> list[Plane]:
     """What borders the target and stands still: the same planes at all places, found in all their points (N, 3)."""
+    if len(rest) == 0:
+        return []
     # Scan lines that fall on one another crowd, and look like lines and no surface: one point a voxel.
-    _, first = np.unique(np.floor(rest / STANDING_VOXEL_M).astype(np.int64) @ VOXEL_KEY, return_index=True)
+    few = rest[first_in_each(rest, STANDING_VOXEL_M)]
     search = PlaneSearch(
         min_points=FEWEST, max_rounds=STANDING_ROUNDS, from_sensor=True, seed=seed, hypotheses=STANDING_HYPOTHESES
     )
-    return [patch.plane for patch in segment_planes(rest[first], search)]
+    return [patch.plane for patch in segment_planes(few, search)]
 
 
 def _shared_out(
@@ -328,7 +403,7 @@ def _shared_out(
     )
 
 
-def _is_in_view(local: FloatArray, found: CornerCandidate, reference: CornerCandidate) -> bool:
+def _is_in_view(local: FloatArray, found: CornerCandidate, reference: CornerCandidate, edges: _Edges) -> bool:
     """Whether most beams towards each face's known outline end on the face."""
     shift = found.corner - reference.corner
     a, b, c = (o + shift for o in reference.outlines)
@@ -337,8 +412,15 @@ def _is_in_view(local: FloatArray, found: CornerCandidate, reference: CornerCand
     index = np.flatnonzero(local @ axis > cosine * range_m)
     range_m = range_m[index]
     rays = local.take(index, axis=0) / range_m[:, None]
-    mask = FaceMask(found.corner, found.normals, found.convex, (a, b, c), found.obstacles, MARGIN_M)
+    mask = FaceMask(
+        found.corner, found.normals, found.convex, (a, b, c), found.obstacles, MARGIN_M, edges.by_face_at(found.corner)
+    )
     wanted, there = mask.endings(rays, range_m, 2.0 * GATE_SIGMAS * found.sigma_m)
+    return _mostly_ends(wanted, there)
+
+
+def _mostly_ends(wanted: IntArray, there: IntArray) -> bool:
+    """Whether most of the beams towards each face (3,) end there (3,)."""
     return bool((there >= SHARE * wanted).all() and (there >= FEWEST // 2).all())
 
 

@@ -122,7 +122,7 @@ def eigen(matrix: Any) -> Any:
 
 
 @kernel
-def _covariance(points: Any, count: float) -> Any:
+def mean_and_products(points: Any, count: float = 1.0) -> Any:
     """Mean (3,) of points (N, 3), and the sums of their products around it over a count (3, 3)."""
     mean, second = np.zeros(3), np.zeros((3, 3))
     n = len(points)
@@ -152,7 +152,7 @@ def local_planes(chosen: Any) -> Any:
     hypotheses = chosen.shape[0]
     planes, variances = np.empty((hypotheses, 4)), np.empty((hypotheses, 3))
     for h in range(hypotheses):
-        mean, second = _covariance(chosen[h], float(chosen.shape[1]))
+        mean, second = mean_and_products(chosen[h], float(chosen.shape[1]))
         values, vectors = eigen(second)
         offset = 0.0
         for i in range(3):
@@ -169,7 +169,7 @@ def _spacing(points: Any) -> float:
     n = len(points)
     if n < 4:
         return 0.0
-    values = eigen(_covariance(points, n - 1.0)[1])[0]
+    values = eigen(mean_and_products(points, n - 1.0)[1])[0]
     area = 144.0 * max(values[1], 0.0) * max(values[2], 0.0)
     return float(2.0 * area**0.25 / np.sqrt(n))
 

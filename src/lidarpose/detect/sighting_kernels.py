@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.detect.patch_kernels import eigen
+from lidarpose.detect.target_kernels import faces_met, points_in_box
 from lidarpose.geometry.compiled import kernel
 
 
@@ -282,3 +283,222 @@ def farthest(points: Any, directions: Any) -> Any:
                 best = out
                 found[d] = i
     return found
+
+
+@kernel
+def _across(normal: Any) -> Any:
+    """`geometry.arrays.perpendicular_pair`, as rows (2, 3)."""
+    length = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
+    x, y, z = normal[0] / length, normal[1] / length, normal[2] / length
+    p, q, r = 0.0, -z, y
+    if abs(y) < abs(x):
+        p, q, r = z, 0.0, -x
+    if abs(z) < min(abs(x), abs(y)):
+        p, q, r = -y, x, 0.0
+    across = np.sqrt(p * p + q * q + r * r)
+    p, q, r = p / across, q / across, r / across
+    pair = np.empty((2, 3))
+    pair[0, 0], pair[0, 1], pair[0, 2] = p, q, r
+    pair[1, 0], pair[1, 1], pair[1, 2] = y * r - z * q, z * p - x * r, x * q - y * p
+    return pair
+
+
+@kernel
+def _outline(points: Any, plane: Any, around: Any) -> Any:
+    """`trihedral_corner.convex_outline` of points (N, 3) on a plane (4,), from the directions around it (D, 2)."""
+    pair = _across(plane)
+    directions = np.empty((len(around), 3))
+    for d in range(len(around)):
+        for axis in range(3):
+            directions[d, axis] = around[d, 0] * pair[0, axis] + around[d, 1] * pair[1, axis]
+    far = farthest(points, directions)
+    outline = np.empty((len(around), 3))
+    count = 0
+    for d in range(len(around)):
+        if far[d] == far[d - 1]:
+            continue
+        i = far[d]
+        height = plane[0] * points[i, 0] + plane[1] * points[i, 1] + plane[2] * points[i, 2] - plane[3]
+        for axis in range(3):
+            outline[count, axis] = points[i, axis] - height * plane[axis]
+        count += 1
+    return outline[:count]
+
+
+@kernel
+def _sine(a: Any, b: Any) -> float:
+    """Of the angle between two unit vectors."""
+    x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return float(np.sqrt(x * x + y * y + z * z))
+
+
+@kernel
+def in_view(
+    points: Any,
+    corner: Any,
+    planes: Any,
+    convex: bool,
+    outlines: Any,
+    inward: Any,
+    least: Any,
+    starts: Any,
+    obstacles: Any,
+    cone_m: float,
+    margin_m: float,
+    gate_m: float,
+) -> Any:
+    """How many beams to points (N, 3) are towards each face of a corner (3,), and how many of these end on it (3,).
+
+    `outlines` (V, 3) of all faces say how far a beam may be from the corner; the rest is as in `faces_met`.
+    """
+    distance = np.sqrt(corner[0] ** 2 + corner[1] ** 2 + corner[2] ** 2)
+    a, b, c = corner[0] / distance, corner[1] / distance, corner[2] / distance
+    cosine = 1.0
+    for v in range(len(outlines)):
+        x, y, z = outlines[v, 0], outlines[v, 1], outlines[v, 2]
+        cosine = min(cosine, (a * x + b * y + c * z) / np.sqrt(x * x + y * y + z * z))
+    cosine = np.cos(min(np.arccos(cosine) + cone_m / distance, np.pi))
+    rays, range_m = np.empty((3, len(points))), np.empty(len(points))
+    count = 0
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        if a * x + b * y + c * z > cosine * length:
+            rays[0, count], rays[1, count], rays[2, count] = x / length, y / length, z / length
+            range_m[count] = length
+            count += 1
+    normals, heights = np.empty((3, 3)), np.empty(3)
+    margins, gaps = np.empty((3, 3)), np.empty((3, len(obstacles)))
+    for j in range(3):
+        heights[j] = planes[j, 0] * corner[0] + planes[j, 1] * corner[1] + planes[j, 2] * corner[2]
+        for k in range(3):
+            normals[j, k] = planes[j, k]
+            margins[j, k] = margin_m * _sine(planes[j], planes[k])
+        for k in range(len(obstacles)):
+            gaps[j, k] = max(_sine(planes[j], obstacles[k]), 0.2) * (2.0 * margin_m + 0.01)
+    wanted, there = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    some = rays[:, :count].copy()
+    towards = faces_met(
+        some, range_m[:count], np.inf, normals, heights, convex, inward, least, starts, margins, obstacles, gaps
+    )
+    for i in range(count):
+        k = towards[i]
+        if k >= 0:
+            slope = normals[k, 0] * some[0, i] + normals[k, 1] * some[1, i] + normals[k, 2] * some[2, i]
+            wanted[k] += 1
+            there[k] += abs(range_m[i] - heights[k] / slope) < gate_m
+    return wanted, there
+
+
+@kernel
+def _borders(members: Any, kept: Any, low: Any, high: Any, plane: Any, spread: float) -> bool:
+    """Whether a surface with points (M, 3) on a plane (4,) borders a target with points (N, 3) within a box; see
+    `trihedral_corner._obstacles`."""
+    near = 0
+    for i in range(len(members)):
+        inside = True
+        for axis in range(3):
+            middle, half = 0.5 * (low[axis] + high[axis]), 0.5 * (high[axis] - low[axis])
+            inside = inside and abs(members[i, axis] - middle) < half
+        near += inside
+    if near < 20:
+        return False
+    free, least = 0, np.inf
+    for i in range(len(kept)):
+        height = plane[0] * kept[i, 0] + plane[1] * kept[i, 1] + plane[2] * kept[i, 2] - plane[3]
+        free += height > -3.0 * spread
+        least = min(least, height)
+    return bool(free / len(kept) > 0.97 and least < 0.2)
+
+
+@kernel
+def _in_box_of(points: Any, outlines: Any, shift: Any, margin_m: float) -> Any:
+    """Those (M, 3) of points (N, 3) in the box about outlines (V, 3) that are shifted."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for v in range(len(outlines)):
+        for axis in range(3):
+            low[axis] = min(low[axis], outlines[v, axis] + shift[axis])
+            high[axis] = max(high[axis], outlines[v, axis] + shift[axis])
+    middle, half = np.empty(3), np.empty(3)
+    for axis in range(3):
+        middle[axis] = 0.5 * ((low[axis] - margin_m) + (high[axis] + margin_m))
+        half[axis] = 0.5 * ((high[axis] + margin_m) - (low[axis] - margin_m))
+    return points_in_box(points.reshape(-1), 3, len(points), middle, half)
+
+
+@kernel
+def faces_seen(
+    points: Any,
+    own: Any,
+    planes: Any,
+    normals: Any,
+    outlines: Any,
+    inward: Any,
+    least: Any,
+    starts: Any,
+    lengths: Any,
+    fewest: Any,
+    one_sided: float,
+    around: Any,
+) -> Any:
+    """What `known_corner._sighting` does up to the view: all that a place's points show of a target.
+
+    Parameters
+    ----------
+    points, own : (N, 3), (3,)
+        What lies about the target, and its corner.
+    planes : (3 + S, 4)
+        The three faces as fitted here, and what stands still.
+    normals, outlines, inward, least, starts
+        The reference's: normals (3, 3), outlines (V, 3), and their edges, were its corner the origin.
+    lengths
+        In metres: about the outlines, about their borders, how far a face reaches, how far it may end from the corner;
+        and the gate.
+    fewest
+        Points: of a patch, of a face next to the corner.
+
+    Returns
+    -------
+    1 for convex, 0 for concave, -1 where it is no corner; by face: outlines (3, D, 3), their lengths, points; by plane:
+    root mean square distances, whether it borders the target.
+    """
+    count, size, borders = np.zeros(3, np.int64), np.zeros(3, np.int64), np.zeros(len(planes), np.bool_)
+    shown, heights, all_least = np.empty((3, len(around), 3)), np.empty(3), np.empty(len(least))
+    local = _in_box_of(points, outlines, own, lengths[0])
+    for face in range(3):
+        heights[face] = normals[face, 0] * own[0] + normals[face, 1] * own[1] + normals[face, 2] * own[2]
+    for e in range(len(least)):
+        all_least[e] = least[e] + (inward[e, 0] * own[0] + inward[e, 1] * own[1] + inward[e, 2] * own[2]) - lengths[1]
+    over, _ = over_outlines(local, normals, heights, inward, all_least, starts, lengths[1])
+    owner, spread = shared_out(local, planes, over, lengths[4])
+    members = [local[owner == k] for k in range(len(planes))]
+    begin = np.zeros(4, np.int64)
+    for k in range(3):
+        begin[k + 1] = begin[k] + len(members[k])
+        if len(members[k]) < fewest[0]:
+            return -1, shown, size, count, spread, borders
+    tolerance, faces = np.empty((3, 3)), np.empty((begin[3], 3))
+    for j in range(3):
+        faces[begin[j] : begin[j + 1]] = members[j]
+        for k in range(3):
+            tolerance[j, k] = 3.0 * max(spread[j], spread[k])
+    side, keep = faces_of_corner(faces, begin, own, planes[:3], tolerance, lengths[2], lengths[3], fewest[1], one_sided)
+    if side < 0:
+        return -1, shown, size, count, spread, borders
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    kept = faces[keep]
+    for i in range(len(kept)):
+        for axis in range(3):
+            low[axis], high[axis] = min(low[axis], kept[i, axis] - 0.1), max(high[axis], kept[i, axis] + 0.1)
+    for k in range(3):
+        mine = faces[begin[k] : begin[k + 1]][keep[begin[k] : begin[k + 1]]]
+        count[k] = len(mine)
+        if count[k] < fewest[1]:
+            return -1, shown, size, count, spread, borders
+        outline = _outline(mine, planes[k], around)
+        size[k] = len(outline)
+        shown[k, : len(outline)] = outline
+    for k in range(3, len(planes)):
+        if len(members[k]) >= fewest[0]:
+            borders[k] = _borders(members[k], kept, low, high, planes[k], spread[k])
+    return side, shown, size, count, spread, borders

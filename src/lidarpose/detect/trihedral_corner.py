@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, pairwise
@@ -220,7 +221,7 @@ def _on_its_side(points: FloatArray, face: int, faces: list[PlanePatch], convex:
 
 
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, OUTLINE_DIRECTIONS, endpoint=False)
-_ROUND = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+ROUND = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 
 
 def convex_outline(points: FloatArray, plane: Plane) -> FloatArray:
@@ -228,7 +229,7 @@ def convex_outline(points: FloatArray, plane: Plane) -> FloatArray:
 
     Its vertices are the points farthest out in `OUTLINE_DIRECTIONS` directions.
     """
-    directions = _ROUND @ np.stack(perpendicular_pair(plane.normal))
+    directions = ROUND @ np.stack(perpendicular_pair(plane.normal))
     if points.dtype == np.float64 and points.flags.c_contiguous and pays(0.0, KERNELS):
         from lidarpose.detect.sighting_kernels import farthest as farthest_out
 
@@ -279,6 +280,8 @@ class FaceMask:
     outlines: tuple[FloatArray, FloatArray, FloatArray]
     obstacles: tuple[Plane, ...]
     margin_m: float
+    edges: tuple[tuple[FloatArray, FloatArray], ...] | None = None
+    """The outlines' edges by face, as `outline_edges` has them, where they are known."""
 
     def select(self, directions: FloatArray, range_m: FloatArray, gate_m: float) -> tuple[IntArray, IntArray]:
         """Which returns are of the faces, and of which face each is.
@@ -360,8 +363,10 @@ class FaceMask:
         return np.asarray((inward @ (rays * ((normal @ self.corner) / (normal @ rays))) <= least[:, None]).any(axis=0))
 
     @cached_property
-    def _edges_of(self) -> list[tuple[FloatArray, FloatArray]]:
+    def _edges_of(self) -> Sequence[tuple[FloatArray, FloatArray]]:
         """By face: its outline's edges."""
+        if self.edges is not None:
+            return self.edges
         return [outline_edges(o, n) for o, n in zip(self.outlines, self.normals, strict=True)]
 
     def _off_edge_m(self, face: int, other: int) -> float:

@@ -6,6 +6,7 @@ the other two; and the three corners tell where to look at all places, in all th
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -19,7 +20,7 @@ from lidarpose.detect.trihedral_corner import find_corners
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.corner_result import CornerCandidate
-from lidarpose.model.corner_session import CloudSource, CornerSession
+from lidarpose.model.corner_session import CloudSource, CornerSession, look_at_points
 from lidarpose.solve.corner_alignment import svd_pose
 from lidarpose.solve.corner_matching import SAME_ORIENTATION_RAD, TOLERANCE_M, face_order
 
@@ -108,8 +109,8 @@ def _followed(
         expected = svd_pose(world[three], corners).inverse() @ world
         around = []
         for k, place in enumerate(session.places):
-            points = frames[k] if k in frames else load_points(place.clouds[0])
-            around.append(surroundings(points, corner, expected[k], AROUND_M))
+            about = partial(surroundings, reference=corner, corner=expected[k], around_m=AROUND_M)
+            around.append(about(frames[k]) if k in frames else look_at_points(place.clouds[0], about))
         sightings = sight_again(around, corner, expected, seed=search.seed, part_at=first)
         if sightings is not None:
             return sightings
