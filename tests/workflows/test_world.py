@@ -52,6 +52,21 @@ def test_each_method_finds_the_pose(simulated: Simulated, method: str, degrees: 
         assert xi @ np.linalg.solve(result.covariance, xi) < 22.5  # 99.9 % of chi-square with six degrees
 
 
+def test_coordinates_of_unknown_precision_are_not_taken_for_exact(simulated: Simulated) -> None:
+    # Half a millimetre at three places shows in no residual, and nobody stated it.
+    session, truth, _ = simulated
+    far_apart = [0, 1, 3]
+    few = replace(session, places=tuple(session.places[k] for k in far_apart), world_sigma_m=None)
+    world = np.stack([p.corner_world for p in few.places])
+    rng = np.random.default_rng(5)
+    errors = []
+    for _ in range(10):
+        moved = with_world(few, world + rng.normal(0.0, 5e-4, world.shape))
+        errors.append(squared_error(calibrate_world(moved), truth))
+    assert np.mean(errors) < 12.0
+    assert squared_error(calibrate_world(few), truth) > 0.1
+
+
 def test_coordinates_of_a_national_grid_give_the_same_answer(simulated: Simulated) -> None:
     # About an origin thousands of kilometres away a turn is all but a shift: the pose passed for undetermined.
     session, _, located = simulated

@@ -47,6 +47,8 @@ SETTLED = 1e-3
 FIRST_LEFT = 0.05
 
 
+# How well people measure a target's corner by tape or total station, where they do not say.
+EXPECTED_WORLD_SIGMA_M = 1e-3
 _POSE = "the pose: too few places, or all on one line"
 
 
@@ -415,6 +417,44 @@ def estimate_world_sigma(fit: CornerFit) -> tuple[float, float]:
     -------
     The standard deviation in metres (0 where nothing speaks against exact ones), and twice the gain in log likelihood.
     """
+    grid, values, _ = _world_sigma_likelihood(fit)
+    best = int(np.argmin(values))
+    gain = float(values[0] - values[best])
+    return (float(grid[best]), gain) if gain > 0.5 else (0.0, 0.0)
+
+
+def undetected_world_noise(fit: CornerFit) -> FloatArray:
+    """What to add to the covariance where nobody says how well the world was measured, and the data do not tell.
+
+    No sign of noise is no proof of exact coordinates: three places leave three residuals. Beforehand the standard
+    deviation is taken to be about a millimetre, its density ``(1 + sigma^2 / expected^2)^-2``, of which the mean square
+    is the expected one. Its mean square by the likelihood of the data, times what errors of the coordinates do to an
+    estimate that takes them for exact, is the variance that such an estimate leaves out.
+
+    Parameters
+    ----------
+    fit
+        The joint estimate that took the coordinates for exact.
+
+    Returns
+    -------
+    Covariance (n, n) in the order of `fit.names`.
+    """
+    grid, values, followed = _world_sigma_likelihood(fit)
+    # The grid is even in the logarithm of sigma: each step stands for a width that grows as sigma.
+    log_weight = -0.5 * values - 2.0 * np.log1p((grid / EXPECTED_WORLD_SIGMA_M) ** 2) + np.log(grid)
+    weight = np.exp(log_weight - log_weight.max())
+    return np.asarray(float(weight @ grid**2 / weight.sum()) * (followed @ followed.T))
+
+
+def _world_sigma_likelihood(fit: CornerFit) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The restricted likelihood of the standard deviation of the world's coordinates.
+
+    Returns
+    -------
+    A grid (G,) of it in metres, even in the logarithm; minus twice the log likelihood (G,); and the derivatives (n, 3P)
+    of the other parameters by the coordinates' errors.
+    """
     information, gradient, errors = without_world_noise(fit)
     # Of the errors alone, all else being free, along axes on which they are independent.
     solved = np.linalg.solve(
@@ -427,6 +467,4 @@ def estimate_world_sigma(fit: CornerFit) -> tuple[float, float]:
     variance = grid[:, None] ** 2
     grown = 1.0 + variance * np.maximum(sureness, 0.0)
     values = (np.log(grown) - variance * along / grown).sum(axis=1)
-    best = int(np.argmin(values))
-    gain = float(values[0] - values[best])
-    return (float(grid[best]), gain) if gain > 0.5 else (0.0, 0.0)
+    return grid, values, -solved[:, :-1]

@@ -19,7 +19,7 @@ from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import CornerSession
 from lidarpose.model.observation import LeftOut
 from lidarpose.model.world_run import WorldRun
-from lidarpose.refine.corner_model import CornerFit, CornerState, own_turns, stepped
+from lidarpose.refine.corner_model import CornerFit, CornerState, own_turns, stepped, undetected_world_noise
 from lidarpose.refine.corner_verdict import CornerEvidence, PrecisionLimits, judge_corner_fit
 from lidarpose.refine.face_rims import without_rims
 from lidarpose.refine.face_systems import MIN_RETURNS, MIN_SIGMA_M
@@ -223,6 +223,8 @@ def _judged(
     further = [part.covariance for part in (share, wrong, beside.possible) if part is not None]
     if session.world_sigma_m is None and fit.world_sigma_m > 0.0:
         further.append(unsure_noise(fit))
+    elif session.world_sigma_m is None:
+        further.append(undetected_world_noise(fit))
     further_covariance = np.asarray(sum(further)) if further else None
     evidence = CornerEvidence(
         tuple(p.position for p in used),
