@@ -27,7 +27,8 @@ class Metric:
     target
         At most this where lower is better, at least this where higher is; None where nothing is asked.
     bound
-        Where the target is missed: what bounds the figure, and what was tried.
+        Where the target is missed: what bounds the figure, and what was tried; a line end begins a new paragraph.
+        Metrics that share it are printed together, with it once.
     """
 
     key: str

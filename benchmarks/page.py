@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -68,8 +69,15 @@ def _figures(results: Mapping[str, Any]) -> list[str]:
     missed = [m for m in judged if m.key in values and m.met(values[m.key]) is False]
     if missed:
         lines += ["", "Missed, and what bounds them:", ""]
-        lines += [f"- {m.what}: {text(values[m.key])} {m.unit}. {m.bound}".rstrip() for m in missed]
+        for bound in dict.fromkeys(m.bound for m in missed):
+            together = [f"{m.what}: {text(values[m.key])} {m.unit}".rstrip() for m in missed if m.bound == bound]
+            lines += [f"- {'; '.join(together)}", *(f"  - {each}" for each in _paragraphs(bound))]
     return ["## Figures and targets", "", *lines]
+
+
+def _paragraphs(bound: str) -> list[str]:
+    """What bounds a figure, in short: at its line ends, and where it comes to what was tried."""
+    return [part for part in re.split(r"\n| (?=(?:Tried|Without gain|Not tried):)", bound) if part]
 
 
 def busy(results: Mapping[str, Any]) -> bool:

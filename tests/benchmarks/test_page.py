@@ -46,6 +46,18 @@ def test_the_page_says_what_was_met_missed_not_measured_and_not_installed() -> N
     assert "images/bench-drawn.svg" in met
 
 
+def test_what_bounds_several_figures_is_told_once() -> None:
+    told = results(0.1)
+    told["suites"]["starting"]["figures"] = {"calibrate.plain": 9.0, "calibrate.report": 8.0}
+    lines = page(told).splitlines()
+    first = lines.index("Missed, and what bounds them:") + 2
+    report, plain = BY_KEY["calibrate.report"], BY_KEY["calibrate.plain"]
+    assert lines[first] == f"- {report.what}: 8 x; {plain.what}: 9 x"
+    assert " ".join(line.removeprefix("  - ") for line in lines[first + 1 :] if line.startswith("  - ")) == " ".join(
+        plain.bound.splitlines()
+    )
+
+
 def test_a_busy_machine_is_told() -> None:
     told = page(results(0.9, load=7.0))
     assert "The machine was busy" in told
