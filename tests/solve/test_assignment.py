@@ -54,6 +54,24 @@ def wrong_places(places: tuple[PlaceObservation, ...], truth: Mapping[str, Place
     ]
 
 
+def test_pieces_of_a_line_are_joined_again() -> None:
+    rig = draw_rig(6, places=6)
+    observations = simulate_observations(rig, stripe_step_px=6.0, seed=2)
+    poses = {name: board_poses(observations.camera, c, name) for name, c in observations.corners.items()}
+    features = features_of(observations, 1)
+    truth = {p.position: p for p in observations.places}
+    cut = []
+    for place in features:
+        own = truth[place.position].scan_lines[1]
+        (k,) = (k for k, line in enumerate(place.lines) if line is own)
+        fifth = len(own) // 5
+        parts = [ScanLine(own.angle_rad[s], own.range_m[s], own.sigma_m[s]) for s in (slice(fifth), slice(fifth, None))]
+        cut.append(replace(place, lines=(*place.lines[:k], *parts, *place.lines[k + 1 :])))
+    found = assign(observations.camera, poses, cut)
+    assert len(found.places) == 6
+    assert wrong_places(found.places, truth) == []
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_family_of_rigs_is_assigned_rightly(family: Any) -> None:
     rig = draw_rig(5, family=family, places=None if family == "few-places" else 7)

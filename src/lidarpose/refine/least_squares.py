@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, inverse_2x2
 
 SQRT3 = float(np.sqrt(3.0))
 # OpenBLAS shares products of more multiplications than 2^18 among threads.
@@ -79,9 +79,15 @@ def own_effects(moments: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Least-squares shift and slope (S, 2) of each line by itself, and where there is one."""
     size = moments.shape[1]
     inner = moments[:, size - 3 : size - 1, size - 3 : size - 1]
-    good = np.linalg.det(inner) > 1e-12 * np.maximum(inner[:, 0, 0], 1e-300) ** 2
-    inverse = np.linalg.inv(np.where(good[:, None, None], inner, np.eye(2)))
-    return (inverse @ moments[:, size - 3 : size - 1, -1:])[:, :, 0], np.asarray(good)
+    good = determined_effects(inner)
+    inverse = inverse_2x2(np.where(good[:, None, None], inner, np.eye(2)))
+    return (inverse @ moments[:, size - 3 : size - 1, -1:])[:, :, 0], good
+
+
+def determined_effects(inner: FloatArray) -> BoolArray:
+    """Where the moments (S, 2, 2) of shift and slope tell both."""
+    det = inner[:, 0, 0] * inner[:, 1, 1] - inner[:, 0, 1] * inner[:, 1, 0]
+    return np.asarray(det > 1e-12 * np.maximum(inner[:, 0, 0], 1e-300) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +122,7 @@ def take_out_effects(moments: FloatArray, variance: float) -> tuple[FloatArray, 
     reduced = moments[:, keep, :][:, :, keep]
     if variance <= 0.0:
         return reduced, LineEffects(np.zeros((S, 2, 2)), np.zeros((S, 2)), coupling[:, :, :-1])
-    shrink = np.linalg.inv(inner + np.eye(2) / variance)
+    shrink = inverse_2x2(inner + np.eye(2) / variance)
     reduced = reduced - np.swapaxes(coupling, 1, 2) @ shrink @ coupling
     predicted = (shrink @ coupling[:, :, -1:])[:, :, 0]
     return reduced, LineEffects(shrink, predicted, coupling[:, :, :-1])

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, inverse_2x2
 from lidarpose.geometry.robust import chi2_tail
+from lidarpose.refine.least_squares import determined_effects
 
 LINE_CORE, LINE_REJECT = 25.0, 49.0
 """A line whose shift and slope have a chi-square (two degrees of freedom) above the first loses weight, and all of it
@@ -47,8 +48,14 @@ class PlaceEffects:
     certainty_factor: float = 1.0
 
 
-_Standardised = tuple[FloatArray, FloatArray, FloatArray]
-"""Inverse covariances (S, 2, 2), squared standardised effects (S,), degrees of freedom (S,), all at one variance."""
+@dataclass(frozen=True, eq=False)
+class _Standardised:
+    """Lines' effects at one variance: inverse covariances as (S,) each of both variances and what lies between them,
+    squared standardised effects (S,), and degrees of freedom (S,)."""
+
+    inverse: tuple[FloatArray, FloatArray, FloatArray]
+    square: FloatArray
+    freedom: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +68,14 @@ class _Effects:
     absorbed: FloatArray
 
     def standardised(self, variance: float) -> _Standardised:
-        inverse = np.linalg.inv(self.covariance + variance * np.eye(2))
-        square = np.einsum("si,sij,sj->s", self.own, inverse, self.own)
-        freedom = np.maximum(2.0 - np.einsum("sij,sji->s", inverse, self.absorbed), 0.0)
-        return inverse, square, freedom
+        # Two by two: written out, a fraction of what NumPy's own calls take.
+        C, A, (x, y) = self.covariance, self.absorbed, self.own.T
+        first, second, both = C[:, 0, 0] + variance, C[:, 1, 1] + variance, 0.5 * (C[:, 0, 1] + C[:, 1, 0])
+        det = first * second - both * both
+        p, q, r = second / det, first / det, -both / det
+        square = p * x * x + 2.0 * r * x * y + q * y * y
+        taken = p * A[:, 0, 0] + r * (A[:, 0, 1] + A[:, 1, 0]) + q * A[:, 1, 1]
+        return _Standardised((p, q, r), square, np.maximum(2.0 - taken, 0.0))
 
 
 def place_effects(moments: FloatArray, spread: FloatArray, before: float = 0.0) -> PlaceEffects:
@@ -102,15 +113,15 @@ def place_effects(moments: FloatArray, spread: FloatArray, before: float = 0.0) 
         return PlaceEffects(0.0, _line_weights(without, good))
     if variance == 0.0:
         return PlaceEffects(0.0, weight)
-    freedom = float((weight * good) @ at[2])
+    freedom = float((weight * good) @ at.freedom)
     return PlaceEffects(variance, weight, freedom / (freedom - 2.0) if freedom > 3.0 else 3.0)
 
 
 def _effects(moments: FloatArray, spread: FloatArray) -> tuple[_Effects, BoolArray]:
     size = moments.shape[1]
     inner = moments[:, size - 3 : size - 1, size - 3 : size - 1]
-    good = np.linalg.det(inner) > 1e-12 * np.maximum(inner[:, 0, 0], 1e-300) ** 2
-    covariance = np.linalg.inv(np.where(good[:, None, None], inner, np.eye(2)))
+    good = determined_effects(inner)
+    covariance = inverse_2x2(np.where(good[:, None, None], inner, np.eye(2)))
     coupling = covariance @ moments[:, size - 3 : size - 1, :]
     to_parameters = coupling[:, :, : size - 3]
     absorbed = to_parameters @ spread @ np.swapaxes(to_parameters, 1, 2)
@@ -119,16 +130,14 @@ def _effects(moments: FloatArray, spread: FloatArray) -> tuple[_Effects, BoolArr
 
 def _robust_start(effects: _Effects, good: BoolArray, without: _Standardised) -> float:
     """From the median of the squared standardised effects, which pure noise puts at that of chi-square of 2."""
-    _, square, _ = without
-    ratio = float(np.median(square[good])) / _MEDIAN_CHI_SQUARE_2
+    ratio = float(np.median(without.square[good])) / _MEDIAN_CHI_SQUARE_2
     size = float(np.median(np.trace(effects.covariance[good], axis1=1, axis2=2))) / 2.0
     return max(ratio - 1.0, 0.0) * size
 
 
 def _line_weights(at: _Standardised, good: BoolArray) -> FloatArray:
     """Weights (S,), below 1 for lines that contradict all others; at most a quarter can be the odd ones out."""
-    _, square, _ = at
-    root = (np.sqrt(square) - np.sqrt(LINE_CORE)) / (np.sqrt(LINE_REJECT) - np.sqrt(LINE_CORE))
+    root = (np.sqrt(at.square) - np.sqrt(LINE_CORE)) / (np.sqrt(LINE_REJECT) - np.sqrt(LINE_CORE))
     weight = np.where(good, 0.5 * (1.0 + np.cos(np.pi * np.clip(root, 0.0, 1.0))), 1.0)
     if (weight < 0.5).sum() > max(int(_MOST_LEFT_OUT * good.sum()), 1):
         return np.ones(len(weight))
@@ -136,14 +145,13 @@ def _line_weights(at: _Standardised, good: BoolArray) -> FloatArray:
 
 
 def _scoring_step(effects: _Effects, weight: FloatArray, at: _Standardised) -> float:
-    inverse, _, freedom = at
-    standard = (inverse @ effects.own[:, :, None])[:, :, 0]
-    found = float(weight @ (standard**2).sum(axis=1))
-    expected = float(weight @ (np.trace(inverse, axis1=1, axis2=2) * freedom / 2.0))
-    fisher = float(weight @ np.einsum("sij,sji->s", inverse, inverse))
+    (p, q, r), (x, y) = at.inverse, effects.own.T
+    found = float(weight @ ((p * x + r * y) ** 2 + (r * x + q * y) ** 2))
+    expected = float(weight @ ((p + q) * at.freedom / 2.0))
+    fisher = float(weight @ (p * p + 2.0 * r * r + q * q))
     return (found - expected) / max(fisher, 1e-300)
 
 
 def _significant(without: _Standardised, use: BoolArray, level: float) -> bool:
-    _, square, freedom = without
-    return bool(chi2_tail(float(square[use].sum()), max(float(freedom[use].sum()), 1.0)) < level)
+    freedom = max(float(without.freedom[use].sum()), 1.0)
+    return bool(chi2_tail(float(without.square[use].sum()), freedom) < level)

@@ -5,12 +5,13 @@ A line is a stripe or a scan line on one panel at one place. What cannot be used
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, inverse_2x2
 from lidarpose.model.camera import Camera
 from lidarpose.model.observation import LeftOut, PanelCorners, ScanLine, StripePoints, TurntableObservations
 
@@ -207,37 +208,45 @@ def _slots(observations: TurntableObservations) -> tuple[Slot, ...]:
     )
 
 
-def _lines(items: list[tuple[int, int, FloatArray, FloatArray]]) -> Lines:
-    """`items`: place, slot, coordinate along the line, sigma."""
-    start = np.concatenate([[0], np.cumsum([len(item[2]) for item in items], dtype=np.int64)]).astype(np.int64)
-    along = []
-    for _, _, coordinate, _ in items:
-        low, high = coordinate.min(), coordinate.max()
-        along.append((2.0 * coordinate - low - high) / max(high - low, 1e-12))
-    return Lines(
-        np.array([item[0] for item in items], dtype=np.int64),
-        np.array([item[1] for item in items], dtype=np.int64),
-        start,
-        np.concatenate([*along, np.zeros(0)]),
-        np.concatenate([*(item[3] for item in items), np.zeros(0)]),
-    )
+def _of_two_rows(good: BoolArray, count: Sequence[int]) -> tuple[list[int], IntArray, BoolArray]:
+    """Lines with two good rows or more: which, their numbers of good rows, and the rows (N,) that are kept."""
+    line = np.repeat(np.arange(len(count)), count)
+    left = np.bincount(line[good], minlength=len(count))
+    return np.flatnonzero(left >= 2).tolist(), left[left >= 2], np.asarray(good & (left >= 2)[line])
+
+
+def _starts(count: IntArray) -> IntArray:
+    """Where lines of so many rows begin, and where the last one ends."""
+    return np.concatenate([[0], np.cumsum(count, dtype=np.int64)]).astype(np.int64)
+
+
+def _lines(owners: Sequence[tuple[int, int]], count: IntArray, coordinate: FloatArray, sigma: FloatArray) -> Lines:
+    """Lines of so many rows each on places and slots; rows' coordinates along them and standard deviations (N,)."""
+    start = _starts(count)
+    along = coordinate
+    if len(count):
+        low, high = (np.repeat(end.reduceat(coordinate, start[:-1]), count) for end in (np.minimum, np.maximum))
+        along = (2.0 * coordinate - low - high) / np.maximum(high - low, 1e-12)
+    place, slot = np.array(owners, dtype=np.int64).reshape(-1, 2).T
+    return Lines(place, slot, start, along, sigma)
 
 
 def _stripe_rows(camera: Camera, items: list[tuple[int, int, StripePoints]]) -> StripeRows:
-    kept: list[tuple[int, int, FloatArray, FloatArray]] = []
-    pixels: list[FloatArray] = [np.zeros((0, 2))]
-    normals: list[FloatArray] = [np.zeros((0, 2))]
-    for place, slot, stripe in items:
-        good = np.isfinite(stripe.pixels).all(1) & np.isfinite(stripe.normals).all(1) & (stripe.sigma_px > 0.0)
-        good &= np.isfinite(stripe.sigma_px)
-        if good.sum() < 2:
-            continue
-        normal = stripe.normals[good]
-        main = np.linalg.eigh(normal.T @ normal)[1][:, 0]
-        kept.append((place, slot, stripe.pixels[good] @ main, stripe.sigma_px[good]))
-        pixels.append(stripe.pixels[good])
-        normals.append(normal)
-    return stripe_rays(camera, _lines(kept), np.concatenate(pixels), np.concatenate(normals))
+    if not items:
+        none = np.zeros((0, 2))
+        return stripe_rays(camera, _lines([], np.zeros(0, dtype=np.int64), none[:, 0], none[:, 0]), none, none)
+    pixels, normals = (np.concatenate([getattr(s, name) for _, _, s in items]) for name in ("pixels", "normals"))
+    sigma = np.concatenate([s.sigma_px for _, _, s in items])
+    good = np.isfinite(pixels).all(axis=1) & np.isfinite(normals).all(axis=1) & (sigma > 0.0) & np.isfinite(sigma)
+    kept, count, good = _of_two_rows(good, [len(s) for _, _, s in items])
+    pixels, normals, sigma = pixels[good], normals[good], sigma[good]
+    # Along the direction that a stripe's normals have least of.
+    scatter = np.zeros((0, 2, 2))
+    if kept:
+        scatter = np.add.reduceat(normals[:, :, None] * normals[:, None, :], _starts(count)[:-1])
+    main = np.repeat(np.linalg.eigh(scatter)[1][:, :, 0], count, axis=0)
+    lines = _lines([items[k][:2] for k in kept], count, (pixels * main).sum(axis=1), sigma)
+    return stripe_rays(camera, lines, pixels, normals)
 
 
 def stripe_rays(camera: Camera, lines: Lines, pixels: FloatArray, normals: FloatArray) -> StripeRows:
@@ -247,9 +256,9 @@ def stripe_rays(camera: Camera, lines: Lines, pixels: FloatArray, normals: Float
     ideal = np.where(lost[:, None], 0.0, ideal)
     rays = np.column_stack([ideal, np.ones(len(ideal))])
     _, J = camera.project_with_jacobian(rays) if len(rays) else (None, np.zeros((0, 2, 3)))
-    inverse = np.linalg.inv(J[:, :, :2]) if len(rays) else np.zeros((0, 2, 2))
-    per_px = np.einsum("nij,nj->ni", inverse, normals)
-    per_focal = np.einsum("nij,nj->ni", inverse, -(pixels - camera.K[:2, 2]))
+    inverse = inverse_2x2(J[:, :, :2])
+    per_px = (inverse @ normals[:, :, None])[:, :, 0]
+    per_focal = (inverse @ (camera.K[:2, 2] - pixels)[:, :, None])[:, :, 0]
     flat = np.zeros((len(rays), 1))
     if lost.any():
         lines = replace(lines, sigma=np.where(lost, np.inf, lines.sigma))
@@ -258,22 +267,21 @@ def stripe_rays(camera: Camera, lines: Lines, pixels: FloatArray, normals: Float
 
 
 def _range_rows(items: list[tuple[int, int, ScanLine]], has_intensity: bool) -> RangeRows:
-    kept: list[tuple[int, int, FloatArray, FloatArray]] = []
-    angles: list[FloatArray] = [np.zeros(0)]
-    ranges: list[FloatArray] = [np.zeros(0)]
-    intensities: list[FloatArray] = [np.zeros(0)]
-    for place, slot, line in items:
-        good = np.isfinite(line.angle_rad) & np.isfinite(line.range_m) & (line.range_m > 0.0)
-        good &= np.isfinite(line.sigma_m) & (line.sigma_m > 0.0)
-        if good.sum() < 2:
-            continue
-        kept.append((place, slot, line.angle_rad[good], line.sigma_m[good]))
-        angles.append(line.angle_rad[good])
-        ranges.append(line.range_m[good])
-        intensities.append(np.zeros(int(good.sum())) if line.intensity is None else line.intensity[good])
-    intensity = np.concatenate(intensities)
-    darkness = _darkness(intensity) if has_intensity else np.zeros(len(intensity))
-    return RangeRows(_lines(kept), np.concatenate(angles), np.concatenate(ranges), darkness)
+    if not items:
+        none = np.zeros(0)
+        return RangeRows(_lines([], np.zeros(0, dtype=np.int64), none, none), none, none, none)
+    angle, measured, sigma = (
+        np.concatenate([getattr(line, name) for _, _, line in items]) for name in ("angle_rad", "range_m", "sigma_m")
+    )
+    good = np.isfinite(angle) & np.isfinite(measured) & (measured > 0.0) & np.isfinite(sigma) & (sigma > 0.0)
+    kept, count, good = _of_two_rows(good, [len(line) for _, _, line in items])
+    angle, measured = angle[good], measured[good]
+    darkness: FloatArray = np.zeros(len(angle))
+    if has_intensity:
+        darkness = _darkness(
+            np.concatenate([line.intensity for _, _, line in items if line.intensity is not None])[good]
+        )
+    return RangeRows(_lines([items[k][:2] for k in kept], count, angle, sigma[good]), angle, measured, darkness)
 
 
 def _darkness(intensity: FloatArray) -> FloatArray:

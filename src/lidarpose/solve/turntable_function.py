@@ -108,6 +108,7 @@ def fit_by_readings(
     covariances: Sequence[FloatArray] | None = None,
     *,
     start: TurntableMotion | None = None,
+    most_reweighed: int = 25,
 ) -> TurntableFunction:
     """The motion that fits the poses best, from the known readings; robust against single bad poses.
 
@@ -123,6 +124,8 @@ def fit_by_readings(
         directions, and so do rotations.
     start
         A motion to start from, where one is known.
+    most_reweighed
+        Weights are settled after so many steps, or for ever.
 
     Raises
     ------
@@ -143,7 +146,7 @@ def fit_by_readings(
     floor = LEAST_SCALE if covariances is None else 1.0
     weight: FloatArray = np.ones(len(angles))
     scaled = information
-    for k in range(25):
+    for k in range(most_reweighed):
         previous = weight
         # Lenient at first: the start rests on two places, and the others lie off it by more than their noise.
         lenience = max(1.0, 16.0 / 2.0**k)
