@@ -50,6 +50,8 @@ DENSE_HYPOTHESES = 400
 FEWEST_OF_SAMPLE = 30
 # Neighbours of fewer seeds are found sooner than a thread is started.
 MANY_HYPOTHESES = 400
+# So many distances are looked through by kernels sooner than a tree is built.
+FEW_DISTANCES = 400_000
 # So many voxels of the subsample tell whether a patch is a surface, and so many hypotheses' neighbourhoods.
 ENOUGH_EVIDENCE = 1000
 ENOUGH_SEEDS = 12
@@ -90,6 +92,12 @@ SCREENED_SHARE = 0.55
 ASKED_SHARE = 0.35
 # Sine of the angle below which a surface counts as seen edge-on.
 EDGE_ON = 0.06
+# Of how many distances the spread is taken.
+SPREAD_POINTS = 20_000
+# What kernels need of these, by kind.
+_GATES = np.array([GATE_SIGMAS, WIDEST, MIN_SIGMA_M, STANDS_OUT, THIN])
+_LIMITS = np.array([SCREENING_WIDTH, LINED_UP, np.cos(SCREENING_RAD), ASKED_SHARE, SCREENED_SHARE])
+_COUNTS = np.array([SCREENING_NEIGHBOURS, SCREENED_POINTS, EVIDENCE_POINTS, SPREAD_POINTS])
 
 
 @dataclass(frozen=True)
@@ -327,6 +335,10 @@ def _draw(
 
 def _near(points: Float32Array, planes: FloatArray, gate_m: float) -> Bits:
     """Which points (S, 3) lie within the gate of which planes (H, 4), in bits (H, W)."""
+    if pays(0.0, KERNELS):
+        from lidarpose.detect.patch_kernels import near_bits
+
+        return np.asarray(near_bits(points, planes, float(gate_m))).view(np.uint64)
     near = np.empty((len(planes), -(-len(points) // 64)), dtype=np.uint64)
     rows, columns = planes.astype(np.float32), np.ascontiguousarray(points.T)
     together = max(DISTANCES_AT_ONCE // max(len(points), 1), 1)
@@ -373,14 +385,22 @@ class _Neighbourhoods:
 
     def points(self) -> Float32Array:
         """(H, K, 3), by turns from more and from fewer of the nearest."""
-        from scipy.spatial import cKDTree
-
         widest = min(NEIGHBOURHOODS[-1], len(self.cloud))
-        tree = cKDTree(self.cloud, LEAF_SIZE, compact_nodes=False, balanced_tree=False)
-        _, neighbours = tree.query(self.cloud[self.seeds], k=widest)
+        neighbours = self._nearest(widest)
         reach = np.minimum(np.array(NEIGHBOURHOODS)[np.arange(len(self.seeds)) % len(NEIGHBOURHOODS)], widest)
         picks = (self.shares * reach[:, None]).astype(np.int64)
         return np.asarray(self.cloud[np.take_along_axis(neighbours, picks, axis=1)])
+
+    def _nearest(self, count: int) -> IntArray:
+        """Positions (H, count) of the points nearest to each seed, the nearest first."""
+        if len(self.seeds) * len(self.cloud) < FEW_DISTANCES and pays(0.0, KERNELS):
+            from lidarpose.detect.patch_kernels import nearest
+
+            return np.asarray(nearest(self.cloud, self.cloud[self.seeds], count))
+        from scipy.spatial import cKDTree
+
+        tree = cKDTree(self.cloud, LEAF_SIZE, compact_nodes=False, balanced_tree=False)
+        return np.asarray(tree.query(self.cloud[self.seeds], k=count)[1])
 
 
 def _local_planes(chosen: Float32Array) -> tuple[FloatArray, FloatArray]:
@@ -463,6 +483,14 @@ def _best_patch(sample: _Sample, active: BoolArray, votes: Float32Array) -> tupl
             best = size, plane, component, int(leader)
     assert best is not None
     _, plane, component, leader_index = best
+    if pays(0.0, KERNELS):
+        from lidarpose.detect.patch_kernels import improved
+
+        row, gate_m = np.append(plane.normal, plane.offset), GATE_SIGMAS * sample.sigma_m
+        component = improved(
+            sample.points, active, component, row, gate_m, sample.refits, MIN_GAP_M, GAP_PER_RANGE, MOST_CELLS
+        )
+        return Plane(row[:3], float(row[3])), component, leader_index
     for _ in range(sample.refits):
         if np.count_nonzero(component) < 6:
             break
@@ -477,15 +505,9 @@ def _best_patch(sample: _Sample, active: BoolArray, votes: Float32Array) -> tupl
 
 def _moment_plane(points: NDArray[np.floating]) -> Plane:
     """Total least squares plane; the normal points to the origin's side."""
-    if pays(0.0, KERNELS):
-        from lidarpose.detect.patch_kernels import eigen, mean_and_products
-
-        mean, products = mean_and_products(points)
-        normal = eigen(products)[1][:, 0].copy()
-    else:
-        mean = points.mean(axis=0, dtype=np.float64)
-        d = points - mean.astype(points.dtype)
-        normal = np.linalg.eigh((d.T @ d).astype(np.float64))[1][:, 0]
+    mean = points.mean(axis=0, dtype=np.float64)
+    d = points - mean.astype(points.dtype)
+    normal = np.linalg.eigh((d.T @ d).astype(np.float64))[1][:, 0]
     offset = float(normal @ mean)
     return Plane(normal, offset) if offset <= 0.0 else Plane(-normal, -offset)
 
@@ -520,6 +542,15 @@ def largest_component(points: Float32Array, inside: BoolArray, plane: Plane) -> 
 def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, component: BoolArray) -> PlanePatch | None:
     """The patch on the full cloud: free points near the plane in the cells that the component occupies."""
     seen = sample.points[component]
+    if sample.seeds is None and pays(0.0, KERNELS):
+        from lidarpose.detect.patch_kernels import refitted
+
+        row = np.append(plane.normal, plane.offset)
+        verdict, mine, spread_m = refitted(
+            x, free, seen, row, sample.sigma_m, _GATES, _LIMITS, _COUNTS, MIN_GAP_M, GAP_PER_RANGE, MOST_CELLS
+        )
+        if verdict >= 0:
+            return PlanePatch(Plane(row[:3], float(row[3])), mine, float(spread_m)) if verdict else None
     raster, cells = raster_of(seen, plane, cell_size_m(seen), 1)
     occupied = np.zeros(raster.shape[0] * raster.shape[1] + 1, dtype=bool)
     occupied[cells] = True
@@ -670,7 +701,7 @@ def _moments_compiled(local: Float32Array, inside: BoolArray) -> tuple[FloatArra
 
 def _spread(distance: Float32Array, first_sigma_m: float) -> float:
     """Robust spread of distances (M,) across a plane, within a factor of the subsample's."""
-    few = distance[:: max(len(distance) // 20_000, 1)]
+    few = distance[:: max(len(distance) // SPREAD_POINTS, 1)]
     return min(max(mad_sigma(few, centred=True), MIN_SIGMA_M, 0.5 * first_sigma_m), WIDEST * first_sigma_m)
 
 

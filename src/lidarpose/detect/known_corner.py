@@ -143,8 +143,7 @@ def sight_again(
         if here is None:
             return None
         planes.append(here)
-        off = np.min([np.abs(plane.distance(local)) for plane in here], axis=0)
-        rest.append(local[off > GATE_SIGMAS * reference.sigma_m])
+        rest.append(_off_planes(local, here, GATE_SIGMAS * reference.sigma_m))
     standing = _standing_planes(np.concatenate(rest), seed)
     if part_at is not None:
         whole = _whole(close[part_at], planes[part_at], standing, reference, edges)
@@ -401,6 +400,18 @@ def _shared_out(
         PlanePatch(plane, mine, float(np.sqrt(np.mean(row[mine] ** 2))) if len(mine) else sigma_m)
         for plane, mine, row in zip(planes, patches, distance, strict=True)
     )
+
+
+def _off_planes(local: FloatArray, planes: Sequence[Plane], gate_m: float) -> FloatArray:
+    """The points (M, 3) of (N, 3) that are near none of the planes."""
+    rows = np.array([[*plane.normal, plane.offset] for plane in planes])
+    if pays(0.0, KERNELS):
+        from lidarpose.detect.sighting_kernels import shared_out
+
+        owner, _ = shared_out(local, rows, np.empty((0, len(local)), dtype=bool), gate_m)
+        return np.asarray(local[owner < 0])
+    off = np.abs(rows[:, :3] @ local.T - rows[:, 3:]).min(axis=0)
+    return local.take(np.flatnonzero(off >= gate_m), axis=0)
 
 
 def _is_in_view(local: FloatArray, found: CornerCandidate, reference: CornerCandidate, edges: _Edges) -> bool:

@@ -311,3 +311,257 @@ def moments(local: Any, inside: Any) -> Any:
         for j in range(3):
             second[i, j] = second[i, j] / s_1 - mean[i] * mean[j]
     return mean, second
+
+
+@kernel
+def _axes(normal: Any) -> Any:
+    """`geometry.arrays.perpendicular_pair`, as rows (2, 3)."""
+    length = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
+    x, y, z = normal[0] / length, normal[1] / length, normal[2] / length
+    p, q, r = 0.0, -z, y
+    if abs(y) < abs(x):
+        p, q, r = z, 0.0, -x
+    if abs(z) < min(abs(x), abs(y)):
+        p, q, r = -y, x, 0.0
+    across = np.sqrt(p * p + q * q + r * r)
+    p, q, r = p / across, q / across, r / across
+    pair = np.empty((2, 3))
+    pair[0, 0], pair[0, 1], pair[0, 2] = p, q, r
+    pair[1, 0], pair[1, 1], pair[1, 2] = y * r - z * q, z * p - x * r, x * q - y * p
+    return pair
+
+
+@kernel
+def _near_plane(points: Any, normal: Any, offset: float, gate: float) -> Any:
+    """Distances (N,) of points (N, 3) from a plane, in single precision, and which are within the gate (N,)."""
+    a, b, c, d = np.float32(normal[0]), np.float32(normal[1]), np.float32(normal[2]), np.float32(offset)
+    distance, inside, width = np.empty(len(points), np.float32), np.empty(len(points), np.uint8), np.float32(gate)
+    for i in range(len(points)):
+        distance[i] = a * points[i, 0] + b * points[i, 1] + c * points[i, 2] - d
+        inside[i] = abs(distance[i]) < width
+    return distance, inside
+
+
+@kernel
+def improved(
+    points: Any, active: Any, component: Any, plane: Any, gate: float, refits: int, gap: float, share: float, most: int
+) -> Any:
+    """`cloud_planes._best_patch`'s local optimisation: a plane (4,) and the component (S,) of points (S, 3) on it."""
+    for _ in range(refits):
+        chosen = points[component]
+        if len(chosen) < 6:
+            break
+        mean, products = mean_and_products(chosen, 1.0)
+        axes = eigen(products)[1]
+        offset = axes[0, 0] * mean[0] + axes[1, 0] * mean[1] + axes[2, 0] * mean[2]
+        sign = 1.0 if offset <= 0.0 else -1.0
+        for axis in range(3):
+            plane[axis] = sign * axes[axis, 0]
+        plane[3] = sign * offset
+        _, inside = _near_plane(points, plane, plane[3], gate)
+        found = largest_piece(points, (inside > 0) & active, _axes(plane), gap, share, most)
+        same = True
+        for i in range(len(found)):
+            same = same and found[i] == component[i]
+        component = found
+        if same:
+            break
+    return component
+
+
+@kernel
+def _first_in_each(points: Any, side: float) -> Any:
+    """`cloud_planes.first_in_each` of points in single precision; empty where cells and numbers fit into no word."""
+    n = len(points)
+    cells, low, high = np.empty((n, 3), np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
+    for axis in range(3):
+        for i in range(n):
+            cell = np.int64(np.floor(points[i, axis] / np.float32(side)))
+            cells[i, axis] = cell
+            low[axis] = cell if i == 0 else min(low[axis], cell)
+            high[axis] = cell if i == 0 else max(high[axis], cell)
+    bits = 0
+    while n >> bits:
+        bits += 1
+    wide, deep = high[1] - low[1] + 1, high[2] - low[2] + 1
+    if float(high[0] - low[0] + 1) * float(wide) * float(deep) * 2.0**bits > 2.0**62:
+        return np.empty(0, np.int64)
+    words = np.empty(n, np.int64)
+    for i in range(n):
+        cell = ((cells[i, 0] - low[0]) * wide + (cells[i, 1] - low[1])) * deep + (cells[i, 2] - low[2])
+        words[i] = cell << bits | i
+    words.sort()
+    first = np.empty(n, np.int64)
+    kept = 0
+    for i in range(n):
+        if i == 0 or words[i] >> bits != words[i - 1] >> bits:
+            first[kept] = words[i] & ((1 << bits) - 1)
+            kept += 1
+    return first[:kept]
+
+
+@kernel
+def _cells_around(seen: Any, axes: Any, cell_m: float, most: int) -> Any:
+    """Cells (n, m) that points (M, 3) occupy on a plane with the axes (2, 3), and those next to them, and where the
+    first cell lies (2,); see `plane_raster`."""
+    along, low, high = np.empty((len(seen), 2), np.int64), np.empty(2, np.int64), np.empty(2, np.int64)
+    for i in range(2):
+        a, b, c = np.float32(axes[i, 0] / cell_m), np.float32(axes[i, 1] / cell_m), np.float32(axes[i, 2] / cell_m)
+        for k in range(len(seen)):
+            cell = np.int64(np.floor(a * seen[k, 0] + b * seen[k, 1] + c * seen[k, 2]))
+            along[k, i] = cell
+            low[i] = cell if k == 0 else min(low[i], cell)
+            high[i] = cell if k == 0 else max(high[i], cell)
+    low -= 1
+    height, width = min(high[0] + 2 - low[0], most), min(high[1] + 2 - low[1], most)
+    allowed = np.zeros((height, width), np.bool_)
+    for k in range(len(seen)):
+        u, v = along[k, 0] - low[0], along[k, 1] - low[1]
+        if u >= height or v >= width:
+            continue
+        for p in range(max(u - 1, 0), min(u + 2, height)):
+            for q in range(max(v - 1, 0), min(v + 2, width)):
+                allowed[p, q] = True
+    return allowed, low
+
+
+@kernel
+def _spread(distance: Any, inside: Any, few: int, least: float, first: float, widest: float) -> float:
+    """`cloud_planes._spread` of the distances (M,) that are inside."""
+    chosen = np.abs(distance[inside > 0])
+    chosen = np.sort(chosen[:: max(len(chosen) // few, 1)])
+    n = len(chosen)
+    middle = 0.5 * (np.float64(chosen[(n - 1) // 2]) + np.float64(chosen[n // 2]))
+    return float(min(max(1.4826022185056018 * middle, least, 0.5 * first), widest * first))
+
+
+@kernel
+def _agree(points: Any, normal: Any, sigma: float, limits: Any, counts: Any) -> bool:
+    """`cloud_planes._neighbours_agree`."""
+    neighbours, asked_points = counts[0], counts[1]
+    if len(points) <= neighbours:
+        return True
+    seeds = points[:: -(-len(points) // asked_points)].copy()
+    found = nearest(points, seeds, neighbours)
+    chosen = np.empty((len(seeds), neighbours, 3), np.float32)
+    for s in range(len(seeds)):
+        for k in range(neighbours):
+            for axis in range(3):
+                chosen[s, k, axis] = points[found[s, k], axis]
+    planes, variances = local_planes(chosen)
+    known = agree = 0
+    for s in range(len(seeds)):
+        if variances[s, 1] > (limits[0] * sigma) ** 2 and variances[s, 1] > limits[1] * variances[s, 2]:
+            known += 1
+            along = planes[s, 0] * normal[0] + planes[s, 1] * normal[1] + planes[s, 2] * normal[2]
+            agree += abs(along) > limits[2]
+    return bool(known < limits[3] * len(seeds) or agree >= limits[4] * known)
+
+
+@kernel
+def stands_out(local: Any, normal: Any, offset: float, sigma: float, gates: Any, limits: Any, counts: Any) -> int:
+    """`cloud_planes._stands_out` with the neighbours asked: 1 or 0; -1 where points are too far apart for it."""
+    points = local[:: max(len(local) // counts[2], 1)].copy()
+    first = _first_in_each(points, gates[0] * sigma)
+    if len(first) == 0:
+        return -1
+    points = points[first]
+    distance, inside = _near_plane(points, normal, offset, gates[0] * sigma)
+    around = np.abs(distance) < np.float32(2.0 * gates[0] * sigma)
+    within = np.int64(0)
+    for i in range(len(inside)):
+        within += inside[i]
+    if within < max(gates[3] * np.count_nonzero(around), 4.0):
+        return 0
+    variances = eigen(moments(points, inside)[1])[0]
+    if not variances[0] < gates[4] ** 2 * variances[1]:
+        return 0
+    return int(_agree(points[around], normal, sigma, limits, counts))
+
+
+@kernel
+def refitted(
+    x: Any,
+    free: Any,
+    seen: Any,
+    plane: Any,
+    sigma: float,
+    gates: Any,
+    limits: Any,
+    counts: Any,
+    gap: float,
+    share: float,
+    most: int,
+) -> Any:
+    """`cloud_planes._refit` of a subsample's plane (4,), in place, found by its points `seen` (C, 3).
+
+    Returns 1 for a patch, 0 for none and -1 where that cannot be told here; the patch's points (M,) among x (N, 3), and
+    their spread. `gates`, `limits` and `counts` are the thresholds that `cloud_planes` has gathered.
+    """
+    nothing = np.empty(0, np.int64)
+    axes, cell_m = _axes(plane), cell_size(seen, gap, share)
+    allowed, origin = _cells_around(seen, axes, cell_m, most)
+    centre, normal = np.empty(3), plane[:3].copy()
+    for axis in range(3):
+        total = 0.0
+        for k in range(len(seen)):
+            total += seen[k, axis]
+        centre[axis] = total / len(seen)
+    middle = centre.astype(np.float32)
+    reach = np.float32(2.0 * gates[1] * gates[0] * sigma)
+    across = (axes / cell_m).astype(np.float32)
+    near, local = points_near(
+        x, free, normal.astype(np.float32), np.float32(plane[3]), reach, across, origin, allowed, middle
+    )
+    if len(near) < 6:
+        return 0, nothing, sigma
+    offset = plane[3] - (normal[0] * centre[0] + normal[1] * centre[1] + normal[2] * centre[2])
+    spread = sigma
+    inside, variances = np.empty(0, np.uint8), np.empty(3)
+    for _ in range(3):
+        distance, inside = _near_plane(local, normal, offset, gates[0] * spread)
+        within = np.int64(0)
+        for i in range(len(inside)):
+            within += inside[i]
+        if within < 6:
+            return 0, nothing, spread
+        mean, second = moments(local, inside)
+        variances, vectors = eigen(second)
+        for axis in range(3):
+            normal[axis] = vectors[axis, 0]
+        offset = normal[0] * mean[0] + normal[1] * mean[1] + normal[2] * mean[2]
+        spread = _spread(distance, inside, counts[3], gates[2], sigma, gates[1])
+    # Thin beside its extents.
+    if not (spread**2 < 0.35**2 * variances[1] and spread**2 < 0.1**2 * variances[2]):
+        return 0, nothing, spread
+    verdict = stands_out(local, normal, offset, spread, gates, limits, counts)
+    if verdict < 1:
+        return verdict, nothing, spread
+    offset += normal[0] * centre[0] + normal[1] * centre[1] + normal[2] * centre[2]
+    sign = 1.0 if offset <= 0.0 else -1.0
+    for axis in range(3):
+        plane[axis] = sign * normal[axis]
+    plane[3] = sign * offset
+    return 1, near[inside > 0], spread
+
+
+@kernel
+def near_bits(points: Any, planes: Any, gate: float) -> Any:
+    """`cloud_planes._near` as bytes (H, W), the number of points rounded up to words of 64."""
+    count = len(points)
+    near = np.zeros((len(planes), (count + 63) // 64 * 8), np.uint8)
+    x, y, z = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.float32)
+    for i in range(count):
+        x[i], y[i], z[i] = points[i, 0], points[i, 1], points[i, 2]
+    inside, width = np.zeros(near.shape[1] * 8, np.uint8), np.float32(gate)
+    for h in range(len(planes)):
+        a, b, c, d = np.float32(planes[h, 0]), np.float32(planes[h, 1]), np.float32(planes[h, 2]), planes[h, 3]
+        offset = np.float32(d)
+        for i in range(count):
+            inside[i] = abs(a * x[i] + b * y[i] + c * z[i] - offset) < width
+        for j in range(near.shape[1]):
+            word = np.uint8(0)
+            for k in range(8):
+                word |= np.uint8(inside[8 * j + k] << (7 - k))
+            near[h, j] = word
+    return near
