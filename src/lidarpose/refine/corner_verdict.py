@@ -164,10 +164,10 @@ def _judge_open_crossing(verdict: _Verdict, possible: OpenCrossing, covariance: 
     far = float(np.sqrt(move @ np.linalg.solve(covariance, move)))
     if possible.chance > OPEN_CHANCE and far > OPEN_SIGMAS:
         verdict.doubt(
-            f"the beams are a VLP-16's, which cross {1e3 * MAKERS_CROSSING_M:.0f} mm before its axis; the data leave "
-            "open whether the clouds hold that, and the pose depends on it: state "
-            f"beam_crossing_m = {MAKERS_CROSSING_M:g} under [lidar] if its driver lets all beams start at one point, "
-            "0 if the clouds are right"
+            "the beams rise by a VLP-16's odd degrees, all from one point, and the pose depends on it: those of a real "
+            f"one cross {1e3 * MAKERS_CROSSING_M:.0f} mm before its axis, which its driver has then left out (the ROS "
+            f"driver did until June 2023). State beam_crossing_m = {MAKERS_CROSSING_M:g} under [lidar] in session.toml "
+            "for clouds of a real one, 0 for simulated beams that start at one point; or take a box: its faces tell it"
         )
 
 
@@ -353,9 +353,11 @@ def _judge_world(
         return
     wrong = evidence.wrong
     if wrong is not None and wrong.told and evidence.stated_world_sigma_m is None:
+        also = [f"those of {places[k].position} by {1e3 * off_m:.1f} mm" for k, off_m in wrong.also]
+        or_others = f" (or {', or '.join(also)})" if also else ""
         verdict.doubt(
-            f"the world coordinates of {places[wrong.place].position} are off by {1e3 * wrong.off_m:.1f} mm if all "
-            "others are right, which explains what disagrees better than errors of all: measure them again"
+            f"the world coordinates of {places[wrong.place].position} are off by {1e3 * wrong.off_m:.1f} mm{or_others} "
+            "if all others are right, which explains what disagrees better than errors of all: measure them again"
         )
     worst = int(np.argmax(errors_mm))
     name = places[worst].position

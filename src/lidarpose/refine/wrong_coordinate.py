@@ -29,6 +29,8 @@ class WrongCoordinate:
         Its number among those of the estimate.
     off_m
         By how much, if all others are exact.
+    also
+        Other places that explain as much, nearly, and by how much theirs are then off.
     gain
         Twice the log likelihood that this gains against errors of all places.
     covariance : (n, n)
@@ -39,6 +41,7 @@ class WrongCoordinate:
     off_m: float
     gain: float
     covariance: FloatArray
+    also: tuple[tuple[int, float], ...] = ()
 
     @property
     def told(self) -> bool:
@@ -73,9 +76,12 @@ def wrong_coordinate(fit: CornerFit) -> WrongCoordinate | None:
     # One slip at any of the places is taken to be as likely beforehand as noise at all.
     odds = np.exp(np.clip(0.5 * (gains - common), -50.0, 50.0)) / count
     chance = odds / (1.0 + odds.sum())
-    best = int(np.argmax(gains))
-    off_m = float(np.linalg.norm(moves[best, errors:].reshape(-1, 3)[best] + fit.state.world_errors[best]))
-    return WrongCoordinate(best, off_m, float(gains[best] - common), np.asarray((moves.T * chance) @ moves))
+    order = np.argsort(-gains)
+    best = int(order[0])
+    off_m = np.linalg.norm((moves[:, errors:] + fit.state.world_errors.ravel()).reshape(count, count, 3), axis=2)
+    also = tuple((int(k), float(off_m[k, k])) for k in order[1:] if gains[best] - gains[k] < CONVINCING_GAIN)
+    covariance = np.asarray((moves.T * chance) @ moves)
+    return WrongCoordinate(best, float(off_m[best, best]), float(gains[best] - common), covariance, also)
 
 
 def unsure_noise(fit: CornerFit) -> FloatArray:

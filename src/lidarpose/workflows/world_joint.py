@@ -7,10 +7,12 @@ with the faces' beams selected by that estimate; then without frames and rims th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.robust import box_plot_inliers, mad_sigma
 from lidarpose.geometry.threads import each
@@ -108,7 +110,9 @@ def joint_estimate(
     fit, used = _whole_estimate(mended, found, first, selected, scale_too)
     others = _without_slipped_place(mended, found, fit, used)
     if others is not None:
-        return joint_estimate(session, others, crops, scale_too, limits, own_fits=own_fits)
+        # The other places alone may lie on one line.
+        with suppress(UndeterminedError):
+            return joint_estimate(session, others, crops, scale_too, limits, own_fits=own_fits)
     beside = without_rings(mended, fit, used)
     return _judged(session, found, first, selected, beside, limits)
 
