@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from lidarpose.detect.albedo import MARGIN, PanelAlbedo, edge_scale, erf_table
 from lidarpose.detect.stripe_search import KERNELS, NODE_STEP, CoarseLine, PanelView
-from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.robust import MAD_TO_SIGMA
 from lidarpose.model.image import GrayImage
@@ -23,7 +24,7 @@ from lidarpose.model.image import GrayImage
 # Pixels above this share of the sensor's limit are saturated.
 _BELOW_LIMIT = 0.98
 # Profiles of a band, about, that the width, the squares' colours and a first curve are found from.
-_FEW = 250
+_FEW = 150
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +118,10 @@ def usable_ranges(view: PanelView, lines: Sequence[CoarseLine], curves: Curves) 
     slack = 4 * view.factor
     first = np.array([max(int(np.floor(line.start)) - slack, view.low[axis]) for line in lines])
     last = np.array([min(int(np.ceil(line.end)) + slack, view.high[axis] - 1) for line in lines])
-    u = first[:, None] + np.arange(max(int((last - first).max()) + 1, 1), dtype=np.float64)
+    size = max(int((last - first).max()) + 1, 1)
+    if pays(0.0, KERNELS):
+        return _usable_ranges_compiled(view, curves, steep, first, last, size)
+    u = first[:, None] + np.arange(size, dtype=np.float64)
     v = curves.at(u)
     usable = (u <= last[:, None]) & (v > view.low[across] + 3) & (v < view.high[across] - 4)
     at = np.nonzero(usable)
@@ -127,6 +131,28 @@ def usable_ranges(view: PanelView, lines: Sequence[CoarseLine], curves: Curves) 
     order = np.argsort(~usable, axis=1, kind="stable")[:, : max(int(count.max()), 1)]
     valid = np.arange(order.shape[1]) < count[:, None]
     return Ranges(np.take_along_axis(u, np.where(valid, order, order[:, :1]), axis=1), valid)
+
+
+def _usable_ranges_compiled(
+    view: PanelView, straight: Curves, steep: bool, first: IntArray, last: IntArray, size: int
+) -> Ranges:
+    """`usable_ranges` by kernels; `size` is how many there are at most."""
+    from lidarpose.detect import stripe_kernels
+
+    u = np.empty((len(first), size))
+    count = stripe_kernels.usable_ranges(
+        *_nodes_and_board(view), view.high, first, last, straight.coefficients, steep, u
+    )
+    u = u[:, : max(int(count.max()), 1)]
+    valid = np.arange(u.shape[1]) < count[:, None]
+    return Ranges(np.where(valid, u, u[:, :1]), valid)
+
+
+def _nodes_and_board(view: PanelView) -> tuple[tuple[Any, ...], tuple[Any, ...], float]:
+    """A panel's nodes and usable squares, and where they begin, as kernels take them."""
+    albedo, (rows, columns) = view.albedo, view.nodes.shape[:2]
+    nodes = (view.nodes_and_slopes, rows, columns, NODE_STEP, view.low)
+    return nodes, (albedo.grid_map.columns + MARGIN, albedo.grid_map.rows + MARGIN, albedo.usable), -1.0 - MARGIN
 
 
 def as_pixels(u: FloatArray, v: FloatArray, steep: bool) -> FloatArray:
@@ -185,8 +211,17 @@ def _half_heights(curves: Curves, ranges: Ranges, width: FloatArray) -> FloatArr
 def bands_about(source: Source, ranges: Ranges, curves: Curves, width: FloatArray) -> Bands:
     """The bands about good curves, with the ambient light taken out and the first backgrounds."""
     bands = cut(source, ranges, curves, _half_heights(curves, ranges, width))
-    ambient = _ambient(bands, 2.7 * width, curves)
-    return replace(bands, values=bands.values - ambient, ambient=ambient)
+    own, cross = _ambient_products(bands, curves.at(bands.u), 2.7 * width)
+    if pays(0.0, KERNELS):
+        from lidarpose.detect import stripe_profile_kernels
+
+        values, ambient = bands.values.copy(), np.empty_like(bands.values)
+        where = (bands.u, curves.middle, curves.half, bands.bright)
+        stripe_profile_kernels.take_out(own, cross, *where, values, ambient)
+    else:
+        ambient = _ambient(bands, own, cross, curves)
+        values = bands.values - ambient
+    return replace(bands, values=values, ambient=ambient)
 
 
 def distance_from(bands: Bands, centre: FloatArray) -> FloatArray:
@@ -252,10 +287,8 @@ def spreads(values: FloatArray, which: BoolArray) -> FloatArray:
     return MAD_TO_SIGMA * quantiles(np.abs(values), which, 0.5)
 
 
-def _ambient(bands: Bands, beyond: FloatArray, curves: Curves) -> FloatArray:
-    """The bright image times a share that changes slowly along the stripe, from the pixels `beyond` (B,) this distance
-    from it."""
-    own, cross = _ambient_products(bands, curves.at(bands.u), beyond)
+def _ambient(bands: Bands, own: FloatArray, cross: FloatArray, curves: Curves) -> FloatArray:
+    """The bright image times a share that changes slowly along the stripe, from `_ambient_products`."""
     s = (bands.u - curves.middle) / curves.half
     powers = np.stack([np.ones_like(s), s, s**2], axis=2)
     normal = (powers * own[..., None]).swapaxes(1, 2) @ powers
@@ -323,14 +356,10 @@ def _squares_compiled(
     """`_squares` by kernels."""
     from lidarpose.detect import stripe_kernels
 
-    view, albedo = source.view, source.view.albedo
     grid, per_v, edges = (np.empty((2, *u.shape), np.float32) for _ in range(3))
     inside = np.empty(u.shape, np.float32)
-    lowest = -1.0 - MARGIN
-    board = (albedo.grid_map.columns, albedo.grid_map.rows, lowest, np.float32(lowest), MARGIN, albedo.usable)
-    nodes = (view.nodes_and_slopes, view.nodes.shape[0], view.nodes.shape[1], NODE_STEP, view.low)
-    profiles = (u, centre, cosine, sine, width, albedo.blur_px, source.steep)
-    stripe_kernels.squares(*nodes, *board, *profiles, grid, per_v, edges, inside)
+    profiles = (u, centre, cosine, sine, width, source.view.albedo.blur_px, source.steep)
+    stripe_kernels.squares(*_nodes_and_board(source.view), *profiles, grid, per_v, edges, inside)
     return tuple(grid), tuple(per_v), tuple(edges), inside
 
 

@@ -51,6 +51,8 @@ _SHORT = 300
 _MIN_POINTS = 8
 # Half-height of the band in which the coarse line is made fine, pixels.
 _FIRST_HALF = 12
+# Pixels further from the stripe than this, in widths, show what is beside it.
+_BESIDE = 2.7
 # A profile, or a point, whose centre is worse than this tells nothing.
 _WORST_SIGMA_PX = 0.8
 # Profiles without light keep to the curve by this pull, nothing against a real profile's hundredths.
@@ -278,34 +280,52 @@ def _first_curves_compiled(bands: Bands, share: FloatArray, straight: Curves) ->
 def _start(bands: Bands, curves: Curves, width: FloatArray, ratio: FloatArray, noise: FloatArray | None) -> _State:
     """Heights and backgrounds by least squares with all else as given; a guess of the noise from the pixels beside."""
     centre = curves.at(bands.u)
-    n, b, v, bb, bv = _start_sums(bands, centre, width, ratio)
+    if pays(0.0, KERNELS):
+        return _start_compiled(bands, centre, width, ratio, noise)
+    distance = distance_from(bands, centre) * for_table(1.0 / width)
+    n, b, v, bb, bv = _start_sums(bands, distance, ratio)
     det = np.maximum(n * bb - b * b, 1e-3)
     height = np.maximum((n * bv - b * v) / det, 1.0)
     background = (v - height * b) / np.maximum(n, 1.0)
     if noise is None:
-        distance = distance_from(bands, centre) * for_table(1.0 / width)
-        flank = bands.good * (np.abs(distance) > 2.7)
+        flank = bands.good * (np.abs(distance) > _BESIDE)
         rest = np.abs(bands.values - for_table(background)) * flank
-        reading = 1.25 * rest.sum(axis=(0, 2)) / np.maximum(flank.sum(axis=(0, 2)), 1.0)
-        noise = np.stack([np.maximum(reading, 0.3) ** 2, np.zeros(len(ratio)), np.zeros(len(ratio))], axis=1)
+        rest_sum, count = (x.sum(axis=0).sum(axis=1, dtype=np.float64) for x in (rest, flank))
+        noise = _first_noise(rest_sum / np.maximum(count, 1.0))
     return _State(height, centre, background, width, ratio, noise, np.ones_like(centre))
 
 
-def _start_sums(bands: Bands, centre: FloatArray, width: FloatArray, ratio: FloatArray) -> Sequence[FloatArray]:
-    """Sums over each profile's good pixels: 1, bell, values, bell^2 and bell * values, (B, N) each."""
-    if pays(0.0, KERNELS):
-        from lidarpose.detect import stripe_kernels
+def _first_noise(distance: FloatArray) -> FloatArray:
+    """A guess of the noise (B, 3) from the mean distance of the pixels beside the stripe from the background."""
+    nothing = np.zeros(len(distance))
+    return np.stack([np.maximum(1.25 * distance, 0.3) ** 2, nothing, nothing], axis=1)
 
-        bell = _bell_compiled(bands, centre, width)
-        each = np.stack([ratio, 1.0 - ratio], axis=1).astype(np.float32)
-        sums = np.empty((5, *centre.shape), np.float32)
-        stripe_kernels.start_sums(bands.values, bands.good, bands.light, bell, each, sums)
-        return list(sums)
-    distance = distance_from(bands, centre) * for_table(1.0 / width)
-    bell = np.exp(np.float32(-0.5) * distance * distance) * (for_table(ratio) + for_table(1.0 - ratio) * bands.light)
+
+def _start_sums(bands: Bands, distance: FloatArray, ratio: FloatArray) -> Sequence[FloatArray]:
+    """Sums over each profile's good pixels: 1, bell, values, bell^2 and bell * values, (B, N) each."""
+    bell = np.exp(np.float32(-0.5) * (distance * distance))
+    bell *= for_table(ratio) + for_table(1.0 - ratio) * bands.light
     weighted = bands.good * bell
     plain = [np.einsum("pbn,pbn->bn", bands.good, x) for x in (np.ones_like(bell), bell, bands.values)]
     return plain + [np.einsum("pbn,pbn->bn", weighted, x) for x in (bell, bands.values)]
+
+
+def _start_compiled(
+    bands: Bands, centre: FloatArray, width: FloatArray, ratio: FloatArray, noise: FloatArray | None
+) -> _State:
+    """`_start` by kernels."""
+    from lidarpose.detect import stripe_kernels
+
+    bell = _bell_compiled(bands, centre, width)
+    height, background = np.empty(centre.shape, np.float32), np.empty(centre.shape, np.float32)
+    each = np.stack([ratio, 1.0 - ratio], axis=1).astype(np.float32)
+    stripe_kernels.start(bands.values, bands.good, bands.light, bell, each, height, background)
+    if noise is None:
+        distance = np.empty(len(width))
+        profiles = (background, for_table(centre), for_table(bands.cosine), np.asarray(1.0 / width, dtype=np.float32))
+        stripe_kernels.beside(bands.v, bands.values, bands.good, *profiles, np.float32(_BESIDE), distance)
+        noise = _first_noise(distance)
+    return _State(height, centre, background, width, ratio, noise, np.ones_like(centre))
 
 
 def _bell_compiled(bands: Bands, centre: FloatArray, width: FloatArray) -> FloatArray:
@@ -510,26 +530,20 @@ def _merged_compiled(bands: Bands, smooth: _Smooth, steep: bool, state: _State) 
     from lidarpose.detect import stripe_profile_kernels
 
     curves = np.concatenate([smooth.curves.coefficients, smooth.curves.middle, smooth.curves.half], axis=1)
-    inflation, points = np.empty(len(curves)), np.empty((len(curves), 5, bands.u.shape[1]))
+    inflation, sigma = np.empty(len(curves)), np.empty(bands.u.shape)
+    pixels, normals = np.empty((*bands.u.shape, 2)), np.empty((*bands.u.shape, 2))
     profiles = (bands.u, bands.valid, smooth.weight, smooth.residual, bands.cosine, bands.sine, curves)
     bounds = ((_BLOCK, _SHORT, _MIN_POINTS), (_WORST_SIGMA_PX, _MODEL_SIGMA_PX), _NOISE_FACTORS[:, 0], _HALVINGS)
-    counts = stripe_profile_kernels.merge(*profiles, *bounds, smooth.problems, inflation, points)
+    points = (inflation, pixels, normals, sigma)
+    counts = stripe_profile_kernels.merge(*profiles, *bounds, steep, smooth.problems, *points)
     found: list[StripeFit | str] = []
     for b, problem in enumerate(smooth.problems.tolist()):
         if problem:
             found.append(_PROBLEMS[problem])
             continue
-        u, v, cosine, sine, sigma = points[b, :, : counts[b]]
-        of_band = _oriented(u, v, cosine, sine, sigma.copy(), steep)
-        found.append(StripeFit(of_band, float(state.width[b]), float(state.dark_ratio[b]), float(inflation[b])))
+        points_b = StripePoints(*(x[b, : counts[b]].copy() for x in (pixels, normals, sigma)))
+        found.append(StripeFit(points_b, float(state.width[b]), float(state.dark_ratio[b]), float(inflation[b])))
     return found
-
-
-def _oriented(
-    u: FloatArray, v: FloatArray, cosine: FloatArray, sine: FloatArray, sigma: FloatArray, steep: bool
-) -> StripePoints:
-    normals = np.stack([cosine, -sine] if steep else [-sine, cosine], axis=-1)
-    return StripePoints(as_pixels(u, v, steep), normals, sigma)
 
 
 def _points(bands: Bands, smooth: _Smooth, steep: bool, state: _State, b: int) -> StripeFit | str:
@@ -562,5 +576,6 @@ def _points(bands: Bands, smooth: _Smooth, steep: bool, state: _State, b: int) -
     u, offset, cosine, sine, sigma = u[worth], offset[worth], cosine[worth], sine[worth], sigma[worth]
     only = np.arange(len(smooth.problems)) == b
     v = smooth.curves.take(only).at(u[None])[0] + offset
-    points = _oriented(u, v, cosine, sine, sigma, steep)
+    normals = np.stack([cosine, -sine] if steep else [-sine, cosine], axis=-1)
+    points = StripePoints(as_pixels(u, v, steep), normals, sigma)
     return StripeFit(points, float(state.width[b]), float(state.dark_ratio[b]), inflation)

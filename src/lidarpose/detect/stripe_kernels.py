@@ -120,8 +120,10 @@ def normal_equations(
 
 
 @kernel
-def start_sums(values: Any, good: Any, light: Any, bell: Any, each: Any, sums: Any) -> None:
-    """The sums (5, B, N) of `stripe_fit._start`; `each` (B, 2) has the light from dark squares, and 1 less that."""
+def start(values: Any, good: Any, light: Any, bell: Any, each: Any, height: Any, background: Any) -> None:
+    """Heights and backgrounds (B, N) of `stripe_fit._start`; `each` (B, 2) has the light from dark squares, and 1 less
+    that."""
+    one, least = np.float32(1.0), np.float32(1e-3)
     profile_pixels, bands, profiles = values.shape
     zero, size = np.float32(0.0), _PIECE
     s = np.zeros(9 * _PIECE, np.float32)
@@ -149,8 +151,49 @@ def start_sums(values: Any, good: Any, light: Any, bell: Any, each: Any, sums: A
                     v1[i] += counts[i] * value[i]
                     bb[i] += weighted * top
                     bv[i] += weighted * value[i]
-            for k in range(5):
-                _copy(s[(4 + k) * size : (5 + k) * size], sums[k, b, first:last], count)
+            for i in range(count):
+                det = n[i] * bb[i] - b1[i] * b1[i]
+                high = (n[i] * bv[i] - b1[i] * v1[i]) / (det if det > least else least)
+                high = high if high > one else one
+                height[b, first + i] = high
+                background[b, first + i] = (v1[i] - high * b1[i]) / (n[i] if n[i] > one else one)
+
+
+@kernel
+def beside(
+    v: Any, values: Any, good: Any, background: Any, centre: Any, cosine: Any, by_width: Any, beyond: Any, found: Any
+) -> None:
+    """Mean distance (B,) from the background of the pixels further than `beyond` widths from the stripe."""
+    profile_pixels, bands, profiles = v.shape
+    zero, one, size = np.float32(0.0), np.float32(1.0), _PIECE
+    s = np.zeros(8 * _PIECE, np.float32)
+    at, value, counts = s[:size], s[size : 2 * size], s[2 * size : 3 * size]
+    middle, tilt, base = s[3 * size : 4 * size], s[4 * size : 5 * size], s[5 * size : 6 * size]
+    far, number = s[6 * size : 7 * size], s[7 * size :]
+    for b in range(bands):
+        total, count_all = 0.0, 0.0
+        for first in range(0, profiles, size):
+            last = min(first + size, profiles)
+            count = last - first
+            _copy(centre[b, first:last], middle, count)
+            _copy(cosine[b, first:last], tilt, count)
+            _copy(background[b, first:last], base, count)
+            for i in range(size):
+                far[i] = zero
+                number[i] = zero
+            for p in range(profile_pixels):
+                _copy(v[p, b, first:last], at, count)
+                _copy(values[p, b, first:last], value, count)
+                _copy(good[p, b, first:last], counts, count)
+                for i in range(size):
+                    d = (at[i] - middle[i]) * tilt[i] * by_width[b]
+                    flank = counts[i] * (one if abs(d) > beyond else zero)
+                    far[i] += abs(value[i] - base[i]) * flank
+                    number[i] += flank
+            for i in range(count):
+                total += np.float64(far[i])
+                count_all += np.float64(number[i])
+        found[b] = total / max(count_all, 1.0)
 
 
 @kernel
@@ -304,6 +347,17 @@ def light_shares(
 
 
 @kernel
+def _take(image: Any, middle: Any, along: Any, shift: int, steep: bool, row: int, column: int, found: Any) -> None:
+    """Pixels of an image, whose first one is at `row` and `column`, at one distance from the middles of profiles."""
+    if steep:
+        for n in range(len(found)):
+            found[n] = image[np.uint64(along[n] - row), np.uint64(middle[n] + shift - column)]
+    else:
+        for n in range(len(found)):
+            found[n] = image[np.uint64(middle[n] + shift - row), np.uint64(along[n] - column)]
+
+
+@kernel
 def cut_band(
     image: Any,
     bright: Any,
@@ -327,23 +381,32 @@ def cut_band(
     least, most = low[across], high[across] - 1
     count = u.shape[1]
     middle, along = np.empty(count, np.int64), np.empty(count, np.int64)
-    counts = np.empty(count, np.float32)
+    counts, at, good_at = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.float32)
+    first, last, bound = most, least, np.float32(limit)
     for n in range(count):
         middle[n], along[n] = np.int64(np.rint(centre[band, n])), np.int64(u[band, n])
         counts[n] = np.float32(1.0) if valid[band, n] else np.float32(0.0)
+        first, last = min(first, middle[n]), max(last, middle[n])
+    is_inside = first - reach >= least and last + reach <= most
     for k in range(2 * reach + 1):
         shift = k - reach
-        within = np.float32(1.0) if abs(shift) <= half else np.float32(0.0)
-        at_row, value_row, level_row, good_row = v[k, band], values[k, band], levels[k, band], good[k, band]
+        value_row, level_row = values[k, band], levels[k, band]
+        if is_inside:
+            _take(image, middle, along, shift, steep, 0, 0, value_row)
+            _take(bright, middle, along, shift, steep, low[1], low[0], level_row)
+        else:
+            for n in range(count):
+                safe = min(max(middle[n] + shift, least), most)
+                row, column = (along[n], safe) if steep else (safe, along[n])
+                value_row[n] = image[np.uint64(row), np.uint64(column)]
+                level_row[n] = bright[np.uint64(row - low[1]), np.uint64(column - low[0])]
+        within = abs(shift) <= half
         for n in range(count):
-            at = middle[n] + shift
-            safe = min(max(at, least), most)
-            row, column = (along[n], safe) if steep else (safe, along[n])
-            value = image[np.uint64(row), np.uint64(column)]
-            at_row[n] = at
-            value_row[n] = value
-            level_row[n] = bright[np.uint64(row - low[1]), np.uint64(column - low[0])]
-            good_row[n] = within * counts[n] if at == safe and value < limit else np.float32(0.0)
+            at[n] = np.float32(middle[n] + shift)
+            there = (at[n] >= least) & (at[n] <= most) & (value_row[n] < bound)
+            good_at[n] = counts[n] if there and within else np.float32(0.0)
+        _copy(at, v[k, band], count)
+        _copy(good_at, good[k, band], count)
 
 
 @kernel
@@ -387,8 +450,12 @@ def samples(
 
 
 @kernel
-def _usable(x: Any, y: Any, lowest: Any, right: float, bottom: float, two: Any, usable: Any) -> bool:
-    """`PanelAlbedo.is_usable` at grid coordinates; `lowest` and `two` have the precision of x and y."""
+def _usable(x: Any, y: Any, lowest: Any, two: Any, board: Any) -> bool:
+    """`PanelAlbedo.is_usable` at grid coordinates; `lowest` and `two` have the precision of x and y.
+
+    `board` are how far it reaches along x and along y, the margin included, and which squares are usable.
+    """
+    right, bottom, usable = board
     if not (x > lowest and y > lowest and x < right and y < bottom):
         return False
     rows, columns = usable.shape
@@ -398,18 +465,53 @@ def _usable(x: Any, y: Any, lowest: Any, right: float, bottom: float, two: Any, 
 
 
 @kernel
+def _from_nodes(nodes: Any, px: Any, py: Any, at: Any) -> None:
+    """`PanelView._at`: the first values of a table of nodes, at a pixel, into `at`.
+
+    `nodes` are the table, its rows and columns, the pixels between them, and the pixel of the first.
+    """
+    table, node_rows, node_columns, node_step, low = nodes
+    one = np.float32(1.0)
+    column, row = (px - low[0]) / node_step, (py - low[1]) / node_step
+    i = min(max(np.int64(column), 0), node_columns - 2)
+    j = min(max(np.int64(row), 0), node_rows - 2)
+    x, y = np.float32(column - i), np.float32(row - j)
+    first = j * node_columns + i
+    for k in range(len(at)):
+        upper = table[first, k] * (one - x) + table[first + 1, k] * x
+        lower = table[first + node_columns, k] * (one - x) + table[first + node_columns + 1, k] * x
+        at[k] = upper * (one - y) + lower * y
+
+
+@kernel
+def usable_ranges(
+    nodes: Any, board: Any, lowest: Any, high: Any, first: Any, last: Any, lines: Any, steep: bool, u: Any
+) -> Any:
+    """`stripe_bands.usable_ranges`: those coordinates from `first` to `last` (B,) whose centre on the `lines` (B, 2),
+    intercept and slope, lies in a usable square, to the front of `u` (B, N), and how many (B,)."""
+    across, low = 0 if steep else 1, nodes[4]
+    lowest, two = np.float32(lowest), np.float32(2.0)
+    at = np.empty(2, np.float32)
+    counts = np.zeros(len(u), np.int64)
+    for b in range(len(u)):
+        n = 0
+        for along in range(first[b], last[b] + 1):
+            v = lines[b, 1] * along + lines[b, 0]
+            if v > low[across] + 3 and v < high[across] - 4:
+                px, py = (v, np.float64(along)) if steep else (np.float64(along), v)
+                _from_nodes(nodes, px, py, at)
+                if _usable(at[0], at[1], lowest, two, board):
+                    u[b, n] = along
+                    n += 1
+        counts[b] = n
+    return counts
+
+
+@kernel
 def squares(
-    table: Any,
-    node_rows: Any,
-    node_columns: Any,
-    node_step: Any,
-    low: Any,
-    columns: Any,
-    rows: Any,
+    nodes: Any,
+    board: Any,
     lowest: Any,
-    lowest_single: Any,
-    margin: Any,
-    usable: Any,
     u: Any,
     centre: Any,
     cosine: Any,
@@ -423,8 +525,7 @@ def squares(
     inside: Any,
 ) -> None:
     """`stripe_bands._squares`, into `grid`, `per_v`, `edges` (2, B, N) and `inside` (B, N)."""
-    one, two = np.float32(1.0), np.float32(2.0)
-    right, bottom = columns + margin, rows + margin
+    two, lowest_single = np.float32(2.0), np.float32(lowest)
     at = np.empty(6, np.float32)
     across = np.empty(2)
     for b in range(u.shape[0]):
@@ -434,15 +535,7 @@ def squares(
         reach = 2.5 * width[b]
         for n in range(u.shape[1]):
             px, py = (centre[b, n], u[b, n]) if steep else (u[b, n], centre[b, n])
-            column, row = (px - low[0]) / node_step, (py - low[1]) / node_step
-            i = min(max(np.int64(column), 0), node_columns - 2)
-            j = min(max(np.int64(row), 0), node_rows - 2)
-            x, y = np.float32(column - i), np.float32(row - j)
-            first = j * node_columns + i
-            for k in range(6):
-                upper = table[first, k] * (one - x) + table[first + 1, k] * x
-                lower = table[first + node_columns, k] * (one - x) + table[first + node_columns + 1, k] * x
-                at[k] = upper * (one - y) + lower * y
+            _from_nodes(nodes, px, py, at)
             c, s = cosine[b, n], sine[b, n]
             for k in range(2):
                 by_first, by_second = at[2 + 2 * k], at[3 + 2 * k]
@@ -453,7 +546,7 @@ def squares(
                 per_v[k, b, n] = by_v * (c * c * thickness + s * s) + by_u * ((1.0 - thickness) * c * s)
                 grid[k, b, n] = at[k]
             dx, dy = reach * across[0], reach * across[1]
-            fine = _usable(at[0], at[1], lowest_single, right, bottom, two, usable)
-            fine = fine and _usable(at[0] - dx, at[1] - dy, lowest, right, bottom, 2.0, usable)
-            fine = fine and _usable(at[0] + dx, at[1] + dy, lowest, right, bottom, 2.0, usable)
+            fine = _usable(at[0], at[1], lowest_single, two, board)
+            fine = fine and _usable(at[0] - dx, at[1] - dy, lowest, 2.0, board)
+            fine = fine and _usable(at[0] + dx, at[1] + dy, lowest, 2.0, board)
             inside[b, n] = np.float32(1.0) if fine else np.float32(0.0)

@@ -75,23 +75,21 @@ def _solve(normal: Any, right: Any) -> None:
 @kernel
 def _fit_curve(x: Any, v: Any, weight: Any, size: int, held: bool, normal: Any, found: Any) -> None:
     """`stripe_bands.fit_curves` of one band, `size` unknowns, x from -1 to 1; without the cube if `held`."""
-    s0, s1, s2, s3, s4, s5, s6 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    r0, r1, r2, r3 = 0.0, 0.0, 0.0, 0.0
+    sums, trace = np.zeros(8), 0.0
+    for i in range(size):
+        found[i] = 0.0
     for n in range(len(x)):
-        w = weight[n]
-        if w != 0.0:
-            t, y = x[n], v[n]
-            w1 = w * t
-            w2 = w1 * t
-            w3 = w2 * t
-            s0, s1, s2, s3 = s0 + w, s1 + w1, s2 + w2, s3 + w3
-            s4, s5, s6 = s4 + w3 * t, s5 + w3 * t * t, s6 + w3 * t * t * t
-            r0, r1, r2, r3 = r0 + w * y, r1 + w1 * y, r2 + w2 * y, r3 + w3 * y
-    sums, goal = (s0, s1, s2, s3, s4, s5, s6), (r0, r1, r2, r3)
-    trace = 0.0
+        if weight[n] != 0.0:
+            power = weight[n]
+            for k in range(size):
+                found[k] += power * v[n]
+                sums[k] += power
+                power *= x[n]
+            for k in range(size, 2 * size - 1):
+                sums[k] += power
+                power *= x[n]
     for i in range(size):
         trace += sums[2 * i]
-        found[i] = goal[i]
         for j in range(size):
             normal[i, j] = sums[i + j]
     trace = max(trace, 1e-30)
@@ -121,6 +119,39 @@ def _horner(coefficients: Any, size: int, x: float) -> float:
 
 
 @kernel
+def take_out(own: Any, cross: Any, u: Any, middle: Any, half: Any, bright: Any, values: Any, ambient: Any) -> None:
+    """`stripe_bands._ambient` from the sums of `ambient_products`: writes `ambient`, and takes it out of `values`."""
+    pixels, bands, profiles = values.shape
+    normal, right = np.empty((3, 3)), np.empty(3)
+    sums, share = np.empty(5), np.empty(profiles, np.float32)
+    for b in range(bands):
+        for k in range(5):
+            sums[k] = 0.0
+        for k in range(3):
+            right[k] = 0.0
+        for n in range(profiles):
+            x = (u[b, n] - middle[b, 0]) / half[b, 0]
+            power, mine = np.float64(own[b, n]), np.float64(cross[b, n])
+            for k in range(5):
+                sums[k] += power
+                power *= x
+            for k in range(3):
+                right[k] += mine
+                mine *= x
+        pull = 1e-6 * (sums[0] + sums[2] + sums[4]) + 1.0
+        for i in range(3):
+            for j in range(3):
+                normal[i, j] = sums[i + j] + (pull if i == j else 0.0)
+        _solve(normal, right)
+        for n in range(profiles):
+            share[n] = _horner(right, 3, (u[b, n] - middle[b, 0]) / half[b, 0])
+        for p in range(pixels):
+            for n in range(profiles):
+                ambient[p, b, n] = share[n] * bright[p, b, n]
+                values[p, b, n] -= ambient[p, b, n]
+
+
+@kernel
 def first_curves(
     values: Any, bright: Any, share: Any, v0: Any, u: Any, valid: Any, straight: Any, least: int, found: Any
 ) -> None:
@@ -142,7 +173,8 @@ def first_curves(
     normal, curve = np.empty((4, 4)), np.empty(4)
     quarter, half_, number = np.float32(0.25), np.float32(0.5), np.float32(pixels)
     for b in range(bands):
-        mean[:] = np.float32(0.0)
+        for n in range(profiles):
+            mean[n], peak[n] = np.float32(0.0), 0
         for p in range(pixels):
             for n in range(profiles):
                 rest[p, n] = values[p, b, n] - share[b] * bright[p, b, n]
@@ -152,11 +184,12 @@ def first_curves(
         for p in range(pixels):
             for n in range(profiles):
                 rest[p, n] -= mean[n]
-        smooth[0], smooth[-1] = rest[0], rest[-1]
+        for n in range(profiles):
+            smooth[0, n], smooth[pixels - 1, n] = rest[0, n], rest[pixels - 1, n]
+            top[n] = rest[0, n]
         for p in range(1, pixels - 1):
             for n in range(profiles):
                 smooth[p, n] = quarter * rest[p - 1, n] + half_ * rest[p, n] + quarter * rest[p + 1, n]
-        top[:], peak[:] = smooth[0], 0
         for p in range(1, pixels):
             for n in range(profiles):
                 if smooth[p, n] > top[n]:
@@ -224,32 +257,32 @@ def take_step(
     `by_sigmas`, typically, or their width `by_share`.
     """
     bands, profiles = centre.shape
-    r = np.empty((14, profiles))
-    moved = np.empty(profiles)
+    r, a, moved = np.empty((12, profiles)), np.empty(14), np.empty(profiles)
     for b in range(bands):
         if not moving[b]:
             continue
         normal, goal = 0.0, 0.0
         for n in range(profiles):
-            a00, a01, a02 = np.float64(rows[0, b, n]) + 1e-9, np.float64(rows[1, b, n]), np.float64(rows[2, b, n])
-            a03, a04, a11 = np.float64(rows[3, b, n]), np.float64(rows[4, b, n]), np.float64(rows[5, b, n]) + 1e-9
-            a12, a13, a14 = np.float64(rows[6, b, n]), np.float64(rows[7, b, n]), np.float64(rows[8, b, n])
-            a22, a23 = np.float64(rows[9, b, n]) + pull, np.float64(rows[10, b, n])
-            a24 = np.float64(rows[11, b, n]) + (curve[b, n] - centre[b, n]) * pull
-            a33, a34 = np.float64(rows[12, b, n]), np.float64(rows[13, b, n])
-            q1, q2, q3 = a01 / a00, a02 / a00, a03 / a00
-            a11, a12, a13, a14 = a11 - q1 * a01, a12 - q1 * a02, a13 - q1 * a03, a14 - q1 * a04
-            a22, a23, a24 = a22 - q2 * a02, a23 - q2 * a03, a24 - q2 * a04
-            a33, a34 = a33 - q3 * a03, a34 - q3 * a04
-            q2, q3 = a12 / a11, a13 / a11
-            a22, a23, a24 = a22 - q2 * a12, a23 - q2 * a13, a24 - q2 * a14
-            a33, a34 = a33 - q3 * a13, a34 - q3 * a14
-            q3 = a23 / a22
-            normal += a33 - q3 * a23
-            goal += a34 - q3 * a24
-            r[0, n], r[1, n], r[2, n], r[3, n], r[4, n] = a00, a01, a02, a03, a04
-            r[5, n], r[6, n], r[7, n], r[8, n] = a11, a12, a13, a14
-            r[9, n], r[10, n], r[11, n] = a22, a23, a24
+            for k in range(14):
+                a[k] = rows[k, b, n]
+            a[0] += 1e-9
+            a[5] += 1e-9
+            a[9] += pull
+            a[11] += (curve[b, n] - centre[b, n]) * pull
+            # The upper triangle, row by row, of three rows of their own, and what they leave of the common one.
+            first = 0
+            for i in range(3):
+                below = first + 5 - i
+                for j in range(1, 4 - i):
+                    share = a[first + j] / a[first]
+                    for k in range(j, 5 - i):
+                        a[below] -= share * a[first + k]
+                        below += 1
+                first += 5 - i
+            normal += a[12]
+            goal += a[13]
+            for k in range(12):
+                r[k, n] = a[k]
         by_width = min(max(goal / (normal + 1e-6), -0.3), 0.3)
         count = 0
         for n in range(profiles):
@@ -376,18 +409,21 @@ def merge(
     limits: Any,
     factors: Any,
     halvings: int,
+    steep: bool,
     problems: Any,
     inflation: Any,
-    points: Any,
+    pixels: Any,
+    normals: Any,
+    sigmas: Any,
 ) -> Any:
-    """`stripe_fit._points` of all bands that `smooth` found no problem with: u, v, cosine, sine and sigma (B, 5, N) of
-    their points, and how many (B,).
+    """`stripe_fit._points` of all bands that `smooth` found no problem with: pixels and normals (B, N, 2) and sigma
+    (B, N) of their points, and how many (B,).
 
     `sizes` are the length of a block, what a stripe is short below, and the fewest points; `limits` the worst sigma
     and what the model is known to.
     """
     bands, profiles = u.shape
-    total, far, some = np.empty(profiles), np.empty(profiles), np.empty(profiles)
+    found, far, some = np.empty((5, profiles)), np.empty(profiles), np.empty(profiles)
     numbers = np.zeros(bands, np.int64)
     for b in range(bands):
         if problems[b] != FINE:
@@ -396,7 +432,6 @@ def merge(
         for n in range(profiles):
             used += valid[b, n] and kept[b, n] != 0.0
         length = sizes[0] if used > sizes[1] else sizes[0] // 2
-        found = points[b]
         m, n = 0, 0
         while n < profiles and valid[b, n]:
             block, seen = np.floor(u[b, n] / length), 0
@@ -408,7 +443,6 @@ def merge(
                 wc, ws = wc + w * cosine[b, n], ws + w * sine[b, n]
                 n += 1
             if seen >= length // 2 and w0 > 0.0:
-                total[m] = w0
                 found[0, m], found[1, m], found[2, m], found[3, m] = wu / w0, wr / w0, wc / w0, ws / w0
                 found[4, m] = 1.0 / np.sqrt(w0)
                 m += 1
@@ -432,10 +466,12 @@ def merge(
         count = 0
         for i in range(m):
             if found[4, i] < bound:
-                for k in range(5):
-                    found[k, count] = found[k, i]
-                x = (found[0, i] - curves[b, 4]) / curves[b, 5]
-                found[1, count] = _horner(curves[b], 4, x) + found[1, i]
+                along = found[0, i]
+                across = _horner(curves[b], 4, (along - curves[b, 4]) / curves[b, 5]) + found[1, i]
+                c, s = found[2, i], found[3, i]
+                pixels[b, count, 0], pixels[b, count, 1] = (across, along) if steep else (along, across)
+                normals[b, count, 0], normals[b, count, 1] = (c, -s) if steep else (-s, c)
+                sigmas[b, count] = found[4, i]
                 count += 1
         numbers[b] = count
         if count < max(sizes[2], m // 2):

@@ -315,19 +315,36 @@ def _find_in_reduced(view: PanelView, small: FloatArray, template: Template, lea
 
 def _find_compiled(view: PanelView, small: FloatArray, template: Template, least: float) -> CoarseLine | str:
     """`_find_in_reduced` by kernels."""
-    from lidarpose.detect import stripe_search_kernels
+    from lidarpose.detect import stripe_search_kernels as kernels
 
-    rest, found = np.empty_like(small), np.empty((3, 8))
+    rest, first, second = np.empty_like(small), np.zeros(8), np.zeros(8)
     squares = (view.light, view.dark, view.inner, template.shape)
     levels = (template.light, template.dark, template.low, template.high)
-    bounds = (_LIT_SHARE, _LEAST_CORRELATION, _AMBIGUOUS, _LEAST_LENGTH)
-    parts = (template.image, view.small_mask, *squares, levels, _DRAWS, _VOTE, _RIDGE_REACH, bounds)
-    answer = stripe_search_kernels.find_line(small, *parts, least, rest, found)
-    if answer < 3:
-        return (_NO_LINE, _ELSEWHERE, _TOO_SHORT)[answer]
-    lines = [_SmallLine(k[7] > 0.0, k[2], k[3], k[0], k[1], k[4]) for k in found[: answer - 2].tolist()]
-    chosen = lines[0] if len(lines) == 1 else _sharper(rest, *lines)
-    return _TWO_LINES if chosen is None else _to_image(chosen, view, float(found[2, 0]))
+    parts = (template.image, view.small_mask, *squares, levels, (_LIT_SHARE, _LEAST_CORRELATION))
+    share, noise, is_elsewhere = kernels.without_light(small, *parts, _RIDGE_REACH, rest)
+    if is_elsewhere:
+        return _ELSEWHERE
+    threshold = max(6.0 * noise, least)
+    if not kernels.best_line(rest, _RIDGE_REACH, threshold, second, 0, _DRAWS, _VOTE, first):
+        return _NO_LINE
+    line, support, length = _as_line(first)
+    if length < _LEAST_LENGTH * min(small.shape):
+        return _TOO_SHORT
+    threshold, apart = max(threshold, 0.3 * line.level), _reach_of(line, small)
+    if kernels.best_line(rest, _RIDGE_REACH, threshold, first, apart, _DRAWS, _VOTE, second):
+        other, others_support, _ = _as_line(second)
+        if others_support > _AMBIGUOUS * support:
+            chosen = _sharper(rest, line, other)
+            if chosen is None:
+                return _TWO_LINES
+            line = chosen
+    return _to_image(line, view, share)
+
+
+def _as_line(found: FloatArray) -> tuple[_SmallLine, float, float]:
+    """Line, its support and its length from what the kernel found."""
+    slope, intercept, start, end, level, support, length, steep = found.tolist()
+    return _SmallLine(steep > 0.0, start, end, slope, intercept, level), support, length
 
 
 def _sharper(rest: FloatArray, a: _SmallLine, b: _SmallLine) -> _SmallLine | None:
@@ -498,9 +515,14 @@ def parabola(n: int, t1: int, t2: int, t3: int, t4: int, y0: int, y1: int, y2: i
     return c0, c1, c2
 
 
+def _reach_of(line: _SmallLine, field: FloatArray) -> int:
+    """How far from a line nothing else is sought: wide enough for the skirts of a saturated stripe."""
+    return int(max(6.0, 0.08 * min(field.shape)) * np.sqrt(1.0 + line.slope**2))
+
+
 def _erase(ridge: FloatArray, line: _SmallLine, steep: bool) -> None:
-    """Blank the line in a ridge image (transposed if `steep`), wide enough for the skirts of a saturated stripe."""
-    reach = int(max(6.0, 0.08 * min(ridge.shape)) * np.sqrt(1.0 + line.slope**2))
+    """Blank the line in a ridge image (transposed if `steep`)."""
+    reach = _reach_of(line, ridge)
     field = ridge if steep == line.steep else ridge.T
     x = np.arange(field.shape[1])
     middle = np.rint(line.intercept + line.slope * x).astype(np.intp)

@@ -101,6 +101,13 @@ def _noise(rest: Any, inner: Any, reach: int, room: Any) -> float:
 
 
 @kernel
+def _clear(values: Any, first: int, last: int) -> None:
+    # Assigning to a slice does the same, and takes numba far longer to compile.
+    for j in range(first, last):
+        values[j] = np.float32(0.0)
+
+
+@kernel
 def _stand_out(middle: Any, one: Any, other: Any, found: Any) -> None:
     """How far values stand out above those on both sides."""
     for j in range(len(found)):
@@ -119,7 +126,7 @@ def _keep_higher(values: Any, at: Any, height: Any, place: Any) -> None:
 @kernel
 def _highest(values: Any, lanes: Any) -> Any:
     """The highest of values above zero, a whole number of lanes."""
-    lanes[:] = np.float32(0.0)
+    _clear(lanes, 0, _LANES)
     for first in range(0, len(values), _LANES):
         some = values[first : first + _LANES]
         for k in range(_LANES):
@@ -140,12 +147,11 @@ def _blank(values: Any, at: Any, away: Any, apart: Any) -> None:
 def _peaks(rest: Any, reach: int, least: Any, away: Any, apart: int, steep: bool, found: Any) -> None:
     """Where the ridges of each column, and of each row, are highest, the first of equal places, and how high.
 
-    `found` (4, M), single, has the columns' places and heights, then the rows', of which only those above `least` are
-    sought. With `apart` > 0, pixels that far from
-    a line do not count: it runs at `away` (M,) in each column, or in each row if `steep`.
+    `found` (4, M), single, all zeros, has the columns' places and heights, then the rows', of which only those above
+    `least` are sought. With `apart` > 0, pixels that far from a line do not count: it runs at `away` (M,) in each
+    column, or in each row if `steep`.
     """
     height, width = rest.shape
-    found[:] = np.float32(0.0)
     ridge = np.zeros((width + _LANES - 1) // _LANES * _LANES, np.float32)
     lanes = np.empty(_LANES, np.float32)
     whole, inner, gap = ridge[:width], ridge[reach : width - reach], np.float32(apart)
@@ -157,14 +163,15 @@ def _peaks(rest: Any, reach: int, least: Any, away: Any, apart: int, steep: bool
         if reach <= i < height - reach:
             _stand_out(row, rest[i - reach], rest[i + reach], whole)
             if apart > 0 and steep:
-                whole[low:high] = np.float32(0.0)
+                _clear(whole, low, high)
             elif apart > 0:
                 _blank(whole, at, away, gap)
             _keep_higher(whole, at, heights, places)
-        whole[:reach], whole[width - reach :] = np.float32(0.0), np.float32(0.0)
+        _clear(whole, 0, reach)
+        _clear(whole, width - reach, width)
         _stand_out(row[reach : width - reach], row[: width - 2 * reach], row[2 * reach :], inner)
         if apart > 0 and steep:
-            whole[low:high] = np.float32(0.0)
+            _clear(whole, low, high)
         elif apart > 0:
             _blank(whole, at, away, gap)
         best = _highest(ridge, lanes)
@@ -254,21 +261,7 @@ def _consensus(peak: Any, height: Any, threshold: Any, draws: Any, extent: int, 
 
 
 @kernel
-def _best_line(peaks: Any, threshold: float, draws: Any, unit: int, shape: Any, found: Any) -> bool:
-    """`stripe_search._best_line` among `_peaks`, to `found` (8,): as `_consensus`, and 1 if it is steep."""
-    height, width = shape
-    other = np.empty(8)
-    least = np.float32(threshold)
-    found[7], other[7] = 0.0, 1.0
-    along = _consensus(peaks[0, :width], peaks[1, :width], least, draws, height, unit, found)
-    across = _consensus(peaks[2, :height], peaks[3, :height], least, draws, width, unit, other)
-    if across and not (along and found[5] >= other[5]):
-        found[:] = other
-    return along or across
-
-
-@kernel
-def find_line(
+def without_light(
     small: Any,
     template: Any,
     mask: Any,
@@ -277,23 +270,19 @@ def find_line(
     inner: Any,
     shape: Any,
     levels: Any,
-    draws: Any,
-    unit: int,
-    reach: int,
     bounds: Any,
-    least: float,
+    reach: int,
     rest: Any,
-    found: Any,
-) -> int:
-    """`stripe_search._find_in_reduced` but for its choice between two lines.
+) -> Any:
+    """What `template` does not explain of a reduced image, into `rest`.
 
-    Returns 0 if nothing stands out, 1 if the image shows other squares, 2 for a line that is too short, 3 for one line,
-    4 for two. `levels` are the template's light, dark, low and high level; `bounds` those of
-    `_is_elsewhere`, of a second line's support, and of the length. `found` (3, 8) are the lines as `_best_line` has
-    them, and the share of the template's light.
+    Returns the share of the template's light, the noise of the ridges in `rest`, and whether the image shows other
+    squares (`rest` is then left as it is).
+
+    `levels` are the template's light, dark, low and high level.
     """
     height, width = small.shape
-    flat = small.reshape(-1)
+    flat = small.ravel()
     room = np.empty(max(len(inner), 1), np.float32)
     share, offset = 0.0, 0.0
     known = len(light) > 0 and len(dark) > 0
@@ -301,31 +290,41 @@ def find_line(
         low = _median_at(flat, dark, room)
         share = max((_median_at(flat, light, room) - low) / max(levels[0] - levels[1], 1.0), 0.0)
         offset = low - share * levels[1]
-    found[2, 0] = share
     if len(inner) >= 10 and _is_elsewhere(flat, inner, shape, levels[3] - levels[2], bounds, room):
-        return 1
+        return share, 0.0, True
     part, ground = np.float32(share), np.float32(offset)
     for i in range(height):
         for j in range(width):
-            rest[i, j] = (small[i, j] - part * template[i, j] - ground) * np.float32(mask[i, j])
-    if not known:
-        rest[:] = np.float32(0.0)
-    threshold = max(6.0 * _noise(rest, inner, reach, room), least) if len(inner) > 0 else least
-    most = max(height, width)
-    peaks, away = np.empty((4, most), np.float32), np.full(most, np.float32(-1e9))
-    _peaks(rest, reach, np.float32(threshold), away, 0, False, peaks)
-    line = found[0]
-    if not _best_line(peaks, threshold, draws, unit, (height, width), line):
-        return 0
-    if line[6] < bounds[3] * min(height, width):
-        return 2
-    steep = line[7] > 0.0
-    # Wide enough for the skirts of a saturated stripe.
-    apart = int(max(6.0, 0.08 * min(height, width)) * np.sqrt(1.0 + line[0] ** 2))
+            value = (small[i, j] - part * template[i, j] - ground) * np.float32(mask[i, j])
+            rest[i, j] = value if known else np.float32(0.0)
+    return share, _noise(rest, inner, reach, room) if len(inner) > 0 else 0.0, False
+
+
+@kernel
+def best_line(
+    rest: Any, reach: int, threshold: float, before: Any, apart: int, draws: Any, unit: int, found: Any
+) -> bool:
+    """`stripe_search._best_line` among the ridges of `rest`: as `_consensus`, and 1 if it is steep, to `found` (8,).
+
+    With `apart` > 0, among pixels that far from the line `before`.
+    """
+    height, width = rest.shape
+    most, least, steep = max(height, width), np.float32(threshold), before[7] > 0.0
+    away = np.empty(most, np.float32)
     last = (width if steep else height) - 1
     for k in range(height if steep else width):
-        away[k] = min(max(np.rint(line[1] + line[0] * k), -apart), last + apart)
-    threshold = max(threshold, 0.3 * line[4])
-    _peaks(rest, reach, np.float32(threshold), away, apart, steep, peaks)
-    again = _best_line(peaks, threshold, draws, unit, (height, width), found[1])
-    return 4 if again and found[1, 5] > bounds[2] * line[5] else 3
+        away[k] = min(max(np.rint(before[1] + before[0] * k), -apart), last + apart)
+    peaks = np.zeros((4, most), np.float32)
+    _peaks(rest, reach, least, away, apart, steep, peaks)
+    line = np.empty(7)
+    any_line = False
+    for way in range(2):
+        count, extent = (width, height) if way == 0 else (height, width)
+        places, heights = peaks[2 * way, :count], peaks[2 * way + 1, :count]
+        is_line = _consensus(places, heights, least, draws, extent, unit, line)
+        if is_line and not (any_line and found[5] >= line[5]):
+            any_line = True
+            for k in range(7):
+                found[k] = line[k]
+            found[7] = way
+    return any_line
