@@ -68,6 +68,18 @@ def command(folder: Path, *options: str) -> None:
         subprocess.run(arguments, check=True, stdout=subprocess.DEVNULL, env=environment)
 
 
+def start(folder: Path) -> None:
+    """What a command does, in a new process, before its images can be shared: start, import, read the session."""
+    code = (
+        "import lidarpose.cli.main as m; m.build_app(); import lidarpose.cli.calibrate, lidarpose.detect.scan_lines; "
+    )
+    code += (
+        "import lidarpose.workflows.turntable; from lidarpose.storage.session import read_turntable_session as read; "
+    )
+    code += "import sys; from pathlib import Path; read(Path(sys.argv[1]))"
+    subprocess.run([sys.executable, "-c", code, str(folder)], check=True)
+
+
 def decode_fastest(folder: Path) -> None:
     """The same images as `calibrate` decodes them: by the fastest decoder there is, shared with forked copies."""
     session = read_turntable_session(folder)
@@ -98,6 +110,8 @@ def simulate(folder: Path, places: int = PLACES) -> None:
 DECODING = "decoding the images alone"
 PLAIN, REPORT = "calibrate, modules and kernels loaded, no report", "calibrate, modules and kernels loaded, report"
 FASTEST = "decoding by the fastest decoder, shared by forked processes"
+BY_NUMPY = "the same by NumPy, no report"
+START = "a new process until its images can be shared: start, imports, session read"
 STAGES = (
     "of that: boards, scan lines and stripes with decoding, all cores",
     "of that: assignment and closed form, one core",
@@ -115,14 +129,20 @@ def least_over(found: Contest, places: int = PLACES) -> float:
     return found.over[FASTEST] + places * STRIPE_S / cores / found.reference_s
 
 
+def least_command_over(found: Contest, places: int = PLACES) -> float:
+    """The same for a command, which has to start first."""
+    return least_over(found, places) + found.over[START]
+
+
 def measure(folder: Path, repeats: int = REPEATS) -> Contest:
     """Every way beside decoding, all of them in turn."""
     ways: dict[str, Callable[[], None]] = {
         FASTEST: lambda: decode_fastest(folder),
         PLAIN: lambda: calibrate(folder, report=False),
         REPORT: lambda: calibrate(folder, report=True),
-        "the same by NumPy, no report": lambda: by_numpy(folder, report=False),
+        BY_NUMPY: lambda: by_numpy(folder, report=False),
         "the same by NumPy, report": lambda: by_numpy(folder, report=True),
+        START: lambda: start(folder),
         PLAIN_COMMAND: lambda: command(folder, "--no-report"),
         COMMAND: lambda: command(folder),
     }
@@ -147,6 +167,7 @@ def main() -> None:
     for name, value in found.seconds.items():
         print(f"{name:70s} {value:8.2f} {found.over[name]:6.2f}")
     print(f"{'the least that any such job takes here':70s} {'':8s} {least_over(found):6.2f}")
+    print(f"{'the least that any such command takes here':70s} {'':8s} {least_command_over(found):6.2f}")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from statistics import median
 import cv2
 
 from benchmarks.calibrate import (
+    BY_NUMPY,
     COMMAND,
     DECODING,
     PLACES,
@@ -16,6 +17,7 @@ from benchmarks.calibrate import (
     PLAIN_COMMAND,
     REPORT,
     STAGES,
+    least_command_over,
     least_over,
     measure,
     simulate,
@@ -32,10 +34,13 @@ def run(effort: Effort) -> Report:
         places = effort.pick(PLACES, 12)
         simulate(session, places)
         found = measure(session, effort.pick(5, 1))
-        with forced(installed()):
-            parts = [stages(session) for _ in range(effort.pick(5, 1))]
+        parts = {}
+        for name, way in ((PLAIN, installed()), (BY_NUMPY, False)):
+            with forced(way):
+                parts[name] = [stages(session) for _ in range(effort.pick(5, 1))]
     figures = {
         "calibrate.least": least_over(found, places),
+        "calibrate.least_command": least_command_over(found, places),
         "calibrate.report": found.over[REPORT],
         "calibrate.plain": found.over[PLAIN],
         "calibrate.report_command": found.over[COMMAND],
@@ -44,8 +49,8 @@ def run(effort: Effort) -> Report:
     rows: list[list[Cell]] = [[DECODING, found.reference_s, 1.0]]
     for name, value in found.seconds.items():
         rows.append([name, value, found.over[name]])
-        if name == PLAIN:
-            medians = {part: median(each[part] for each in parts) for part in STAGES}
+        if name in parts:
+            medians = {part: median(each[part] for each in parts[name]) for part in STAGES}
             rows += [[part, value, value / found.reference_s] for part, value in medians.items()]
     text = (
         "A simulated session of the turntable paper's set-up, 1624 x 1234 pixels, PNG. Decoding is OpenCV's, a thread "
