@@ -49,22 +49,22 @@ def without_foreign_spots(
     All returns where nothing is foreign, or where the face as a whole is turned: that is for the estimate to say.
     """
     seen = _Seen.of(returns, normal, corner)
-    kept = np.arange(len(returns))
     spots = None if _is_dense(seen) else _spots(seen)
     # Where scan lines lie so close, none is needed outside of the outline to tell where the face ends.
     if spots is None or _is_rim_odd(seen.residual[rim] - spots.level_m, sigma_m, spots.spread_m):
-        kept = np.flatnonzero(~rim)
-        if len(kept) == 0:
-            return returns.subset(kept)
-        seen = seen if len(kept) == len(rim) else seen.subset(kept)
+        inner = np.flatnonzero(~rim)
+        if len(inner) < len(rim):
+            returns, seen = returns.subset(inner), seen.subset(inner)
+        if len(inner) == 0:
+            return returns
         spots = _spots(seen)
     odd = _odd(spots, sigma_m)
-    if odd.any() and not _is_turned(returns.subset(kept), seen, spots, normal, corner, sigma_m):
-        if _is_dense(seen):
-            # What is something else does not end where a spot does.
-            odd |= _sum_around(odd, seen.width) > 0
-        kept = kept[~odd[seen.cell]]
-    return returns if len(kept) == len(returns) else returns.subset(kept)
+    if not odd.any() or _is_turned(returns, seen, spots, normal, corner, sigma_m):
+        return returns
+    if _is_dense(seen):
+        # What is something else does not end where a spot does.
+        odd |= _sum_around(odd, seen.width) > 0
+    return returns.subset(np.flatnonzero(~odd[seen.cell]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,8 @@ def _is_turned(
     """Whether a plane of its own explains a face to the noise: then nothing on it is foreign."""
     _, rows = face_rows(returns.rays, normal, corner)
     residual = seen.residual - spots.level_m
-    own = residual - rows.T @ np.linalg.lstsq(rows.T, residual, rcond=None)[0]
+    # Rows in metres and metres by radian: all about one.
+    own = residual - np.linalg.lstsq(rows @ rows.T, rows @ residual, rcond=1e-12)[0] @ rows
     return _only_noise(seen.means(own), seen.count, sigma_m)
 
 

@@ -89,15 +89,22 @@ class PlaceCrop:
     frame: IntArray
     frames: int
 
-    @cached_property
+    @property
     def range_m(self) -> FloatArray:
         """(N,)"""
-        return np.asarray(np.sqrt(np.einsum("ij,ij->i", self.points, self.points)))
+        return self._beams[1]
 
-    @cached_property
+    @property
     def rays(self) -> FloatArray:
         """Unit beam directions as contiguous rows (3, N)."""
-        return np.ascontiguousarray(self.points.T) / self.range_m
+        return self._beams[0]
+
+    @cached_property
+    def _beams(self) -> tuple[FloatArray, FloatArray]:
+        rays = np.ascontiguousarray(self.points.T)
+        range_m = np.sqrt(np.einsum("ij,ij->j", rays, rays))
+        rays = rays / range_m if np.shares_memory(rays, self.points) else np.divide(rays, range_m, out=rays)
+        return rays, range_m
 
     @property
     def directions(self) -> FloatArray:
@@ -487,7 +494,9 @@ def observe(
     def select(task: tuple[CornerCandidate | None, PlaceCrop, FloatArray]) -> dict[int, FaceReturns]:
         sighting, crop, corner = task
         mask = mask_of(sighting or reference, corner, normals, share)
-        return select_faces(crop, mask, GATE_SIGMAS * sigma_m, sigma_m)
+        # Next to the corner of a target that was sighted, hardly anything is foreign; the loss sees to that.
+        screened = share == 1.0 or sighting is None
+        return select_faces(crop, mask, GATE_SIGMAS * sigma_m, sigma_m if screened else None)
 
     tasks = list(zip(found.sightings, crops, corners, strict=True))
     selected = each(select, tasks, max(len(crop.frame) for crop in crops))
