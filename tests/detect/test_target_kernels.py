@@ -62,6 +62,31 @@ def test_the_same_beams_are_of_each_face(convex: bool, gate_m: float) -> None:
     assert selected > 3000
 
 
+@pytest.mark.parametrize("convex", [True, False])
+def test_the_same_beams_come_face_by_face(convex: bool) -> None:
+    rng = np.random.default_rng(7)
+    outside = 0
+    for _ in range(5):
+        mask = some_mask(rng, convex)
+        directions = unit(mask.corner + rng.uniform(-0.8, 0.8, (4000, 3)))
+        with np.errstate(invalid="ignore"):
+            reach = mask.meet(directions)[1]
+        points = directions * np.where(np.isfinite(reach), reach + rng.normal(0.0, 0.02, len(reach)), 1.0)[:, None]
+        with compiled.forced(False):
+            plain = mask.beams_of(points, 0.05)
+        with compiled.forced(True):
+            quick = mask.beams_of(points, 0.05)
+        index, face = mask.select(directions, np.linalg.norm(points, axis=1), 0.05)
+        for j, (one, other) in enumerate(zip(plain, quick, strict=True)):
+            np.testing.assert_array_equal(one.index, index[face == j])
+            np.testing.assert_array_equal(other.index, one.index)
+            np.testing.assert_array_equal(other.on_rim, one.on_rim)
+            np.testing.assert_allclose(other.rays, one.rays, atol=1e-15)
+            np.testing.assert_allclose(other.range_m, one.range_m, rtol=1e-15)
+            outside += int(np.count_nonzero(one.on_rim))
+    assert outside > 100
+
+
 @pytest.mark.parametrize("columns", [3, 4, 7])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_the_same_points_are_in_a_box(dtype: type[np.floating[Any]], columns: int) -> None:

@@ -278,3 +278,85 @@ def outside(rays: Any, normal: Any, height: float, inward: Any, least: Any) -> A
         reach = height / (a * x[i] + b * y[i] + c * z[i])
         points[0, i], points[1, i], points[2, i] = x[i] * reach, y[i] * reach, z[i] * reach
     return far_inside(points, inward, least, 0, len(least)) <= 0.0
+
+
+@kernel
+def beams_of_faces(
+    points: Any,
+    gate_m: float,
+    normals: Any,
+    heights: Any,
+    convex: bool,
+    inward: Any,
+    least: Any,
+    rim_m: float,
+    starts: Any,
+    margins_m: Any,
+    obstacles: Any,
+    gaps_m: Any,
+) -> Any:
+    """Of points (N, 3), those that are of each face, one face after the other; parameters as those of `faces_met`, but
+    for `least`, which is the outlines' own, and `rim_m`, by how much faces are wider.
+
+    Returns
+    -------
+    Which points (M,), how many of each face (3,), their rays (3 M,), three rows for each face, their ranges (M,), and
+    which (M,) lie outside the outlines.
+    """
+    found = np.full(len(points), -1, np.int8)
+    beams = np.empty((4, BLOCK))
+    first, reach = np.empty(BLOCK, np.int64), np.empty(BLOCK)
+    point, who = np.empty((3, 3, BLOCK)), np.empty((3, BLOCK), np.int64)
+    many, total = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    for begin in range(0, len(points), BLOCK):
+        size = min(BLOCK, len(points) - begin)
+        for k in range(size):
+            x, y, z = points[begin + k, 0], points[begin + k, 1], points[begin + k, 2]
+            far = np.sqrt(x * x + y * y + z * z)
+            beams[0, k], beams[1, k], beams[2, k], beams[3, k] = x / far, y / far, z / far, far
+        first_met(beams[0], beams[1], beams[2], normals, heights, convex, size, first, reach)
+        many[:] = 0
+        for k in range(size):
+            expected, face = reach[k], first[k]
+            if not abs(beams[3, k] - expected) < gate_m:
+                continue
+            x, y, z = beams[0, k], beams[1, k], beams[2, k]
+            px, py, pz = x * expected, y * expected, z * expected
+            good = True
+            for other in range(3):
+                slope = normals[other, 0] * x + normals[other, 1] * y + normals[other, 2] * z
+                good &= other == face or abs(slope * expected - heights[other]) > margins_m[face, other]
+            for b in range(len(obstacles)):
+                off = obstacles[b, 0] * px + obstacles[b, 1] * py + obstacles[b, 2] * pz - obstacles[b, 3]
+                good &= off > gaps_m[face, b]
+            at = many[face]
+            point[face, 0, at], point[face, 1, at], point[face, 2, at] = px, py, pz
+            who[face, at] = begin + k
+            many[face] += good
+        for face in range(3):
+            inside = far_inside(point[face, :, : many[face]], inward, least, starts[face], starts[face + 1])
+            for at in range(many[face]):
+                if inside[at] > -rim_m:
+                    found[who[face, at]] = face if inside[at] > 0.0 else face + 3
+                    total[face] += 1
+    count = total.sum()
+    index, ranges, outside_of = np.empty(count, np.int64), np.empty(count), np.empty(count, np.bool_)
+    rays = np.empty(3 * count)
+    starting = np.array([0, total[0], total[0] + total[1]])
+    at = starting.copy()
+    for i in range(len(points)):
+        if found[i] >= 0:
+            face = found[i] % 3
+            k = at[face]
+            index[k], outside_of[k] = i, found[i] >= 3
+            at[face] = k + 1
+    for face in range(3):
+        begin, size = starting[face], total[face]
+        row = 3 * begin
+        for k in range(size):
+            i = index[begin + k]
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            far = np.sqrt(x * x + y * y + z * z)
+            ranges[begin + k] = far
+            rays[row + k], rays[row + size + k], rays[row + 2 * size + k] = x / far, y / far, z / far
+    return index, total, rays, ranges, outside_of

@@ -267,6 +267,17 @@ def _without_doubles(candidates: list[CornerCandidate]) -> tuple[CornerCandidate
 
 
 @dataclass(frozen=True, eq=False)
+class FaceBeams:
+    """The beams that end on a face: which (M,) of all, ascending, their unit rays (3, M), contiguous, and ranges (M,);
+    and which (M,) pass outside of the face's outline, within its rim."""
+
+    index: IntArray
+    rays: FloatArray
+    range_m: FloatArray
+    on_rim: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
 class FaceMask:
     """Which beams meet which face of a corner, told by their direction alone.
 
@@ -321,23 +332,66 @@ class FaceMask:
         """By kernels: the face (N,) that each ray (3, N) and range is of, or -1."""
         from lidarpose.detect.target_kernels import faces_met
 
-        edges = [(inward, least - RIM_M) for inward, least in self._edges_of]
-        planes = np.array([[*plane.normal, plane.offset] for plane in self.obstacles]).reshape(-1, 4)
+        planes, (inward, least, starts), near = self._for_kernels
         found: NDArray[np.int8] = faces_met(
-            rays,
-            np.asarray(range_m, dtype=np.float64),
-            float(gate_m),
-            np.ascontiguousarray(self.normals),
-            self.normals @ self.corner,
-            bool(self.convex),
-            np.concatenate([inward for inward, _ in edges]),
-            np.concatenate([least for _, least in edges]),
-            np.cumsum([0, *(len(least) for _, least in edges)]),
-            np.array([[self._off_edge_m(j, k) for k in range(3)] for j in range(3)]),
-            planes,
-            np.array([[self._off_obstacle_m(j, plane) for plane in self.obstacles] for j in range(3)]).reshape(3, -1),
+            rays, np.asarray(range_m, dtype=np.float64), float(gate_m), *planes, inward, least - RIM_M, starts, *near
         )
         return found
+
+    @cached_property
+    def _for_kernels(
+        self,
+    ) -> tuple[
+        tuple[FloatArray, FloatArray, bool],
+        tuple[FloatArray, FloatArray, IntArray],
+        tuple[FloatArray, FloatArray, FloatArray],
+    ]:
+        """What kernels ask for: the planes; the outlines' edges; margins, and what borders the faces."""
+        edges = self._edges_of
+        planes = np.array([[*plane.normal, plane.offset] for plane in self.obstacles]).reshape(-1, 4)
+        return (
+            (np.ascontiguousarray(self.normals), self.normals @ self.corner, bool(self.convex)),
+            (
+                np.concatenate([inward for inward, _ in edges]),
+                np.concatenate([least for _, least in edges]),
+                np.cumsum([0, *(len(least) for _, least in edges)]),
+            ),
+            (
+                np.array([[self._off_edge_m(j, k) for k in range(3)] for j in range(3)]),
+                planes,
+                np.array([[self._off_obstacle_m(j, plane) for plane in self.obstacles] for j in range(3)]).reshape(
+                    3, -1
+                ),
+            ),
+        )
+
+    def beams_of(self, points: FloatArray, gate_m: float) -> list[FaceBeams]:
+        """By face: the beams of points (N, 3) that end on it, within the gate."""
+        if points.flags.c_contiguous and pays(SAVED_S_PER_BEAM * len(points), "detect.target_kernels"):
+            return self._beams_compiled(points, gate_m)
+        rays = np.ascontiguousarray(points.T)
+        range_m = np.sqrt(np.einsum("ij,ij->j", rays, rays))
+        rays = rays / range_m
+        index, face = self.select(rays.T, range_m, gate_m)
+        parts = np.split(index, np.searchsorted(face, [1, 2]))
+        return [
+            FaceBeams(mine, part, range_m.take(mine), self.on_rim(j, part))
+            for j, mine in enumerate(parts)
+            for part in [rays.take(mine, axis=1)]
+        ]
+
+    def _beams_compiled(self, points: FloatArray, gate_m: float) -> list[FaceBeams]:
+        from lidarpose.detect.target_kernels import beams_of_faces
+
+        planes, (inward, least, starts), near = self._for_kernels
+        index, count, rays, range_m, on_rim = beams_of_faces(
+            points, float(gate_m), *planes, inward, least, RIM_M, starts, *near
+        )
+        ends = np.cumsum(count).tolist()
+        return [
+            FaceBeams(index[a:b], rays[3 * a : 3 * b].reshape(3, -1), range_m[a:b], on_rim[a:b])
+            for a, b in pairwise([0, *ends])
+        ]
 
     def endings(self, directions: FloatArray, range_m: FloatArray, gate_m: float) -> tuple[IntArray, IntArray]:
         """By face: how many of the beams (N, 3) are towards it (3,), and how many of their ranges (N,) end on it (3,),

@@ -403,17 +403,13 @@ def select_faces(
     crop: PlaceCrop, mask: FaceMask, gate_m: float, sigma_m: float | None = None
 ) -> dict[int, FaceReturns]:
     """Each face's returns at a place; with the noise known, without the spots that are plainly something else."""
-    index, face = mask.select(crop.directions, crop.range_m, gate_m)
     faces = {}
-    for j in range(3):
-        mine = index[face == j]
-        if len(mine) < MIN_FACE_RETURNS:
+    for j, beams in enumerate(mask.beams_of(crop.points, gate_m)):
+        if len(beams.index) < MIN_FACE_RETURNS:
             continue
-        returns = FaceReturns(crop.rays.take(mine, axis=1).T, crop.range_m[mine], crop.frame[mine])
+        returns = FaceReturns(beams.rays.T, beams.range_m, crop.frame.take(beams.index))
         if sigma_m is not None:
-            returns = without_foreign_spots(
-                returns, mask.on_rim(j, returns.rays), mask.normals[j], mask.corner, sigma_m
-            )
+            returns = without_foreign_spots(returns, beams.on_rim, mask.normals[j], mask.corner, sigma_m)
         if len(returns) >= MIN_FACE_RETURNS:
             faces[j] = returns
     return faces

@@ -126,7 +126,8 @@ def _crossing(
     """Where the beams seem to cross, from some returns `few`, with their `equations` at the fit if these are known;
     `clean` are all, without offsets of rings."""
     told, ring_sigma_m = (0.0, 0.0) if offsets is None else (offsets.told, offsets.sigma_m)
-    factor = common_error_factor(fit, some_returns(clean), told)
+    # Without offsets of rings the returns are the measured ones.
+    factor = common_error_factor(fit, some_returns(clean) if offsets is not None else few, told)
     first = seen_crossing(fit, few, rings, ring_sigma_m, factor, equations)
     if first is None or first.told or session.world_sigma_m is not None or not fit.world_sigma_m > 0.0:
         return first
