@@ -32,9 +32,9 @@ def run(effort: Effort) -> Report:
         folder = Path(temporary) / "session"
         write_corner_session(folder, session)
         result = calibrate_world(read_corner_session(folder))
-        ways = {FIRST: partial(_calibrate, folder, False), **_parts(folder), OPEN3D: _open3d_reading(folder)}
+        ways = {FIRST: partial(_calibrate, folder, False), **_parts(folder, False), OPEN3D: _open3d_reading(folder)}
         if installed():
-            ways[KERNELS] = partial(_calibrate, folder, True)
+            ways |= {KERNELS: partial(_calibrate, folder, True), **_parts(folder, True)}
         works = {name: way for name, way in ways.items() if way is not None}
         for work in (lambda: _read(read_corner_session(folder)), *works.values()):
             work()
@@ -44,14 +44,7 @@ def run(effort: Effort) -> Report:
     text = f"{PLACES} places, {frames} frames each, {points} points in all; the answer is {1e3 * metres:.2f} mm off."
     rows: list[list[Cell]] = [["reading the frames", found.reference_s, 1.0]]
     rows += [[name, value, found.over[name]] for name, value in found.seconds.items()]
-    figures = {
-        "world.reading": found.over[FIRST],
-        "world.find": found.over[FIND],
-        "world.cut": found.over[CUT],
-        "world.least": found.over[LEAST],
-    }
-    if KERNELS in found.over:
-        figures["world.kernels"] = found.over[KERNELS]
+    figures = {figure: found.over[name] for figure, name in _FIGURES.items() if name in found.over}
     if OPEN3D in found.over:
         figures["world.open3d_reading"] = found.over[FIRST] / found.over[OPEN3D]
     return Report(figures, [Table("The world job", ["work", "s", "over reading"], rows, text)])
@@ -63,6 +56,19 @@ FIND = "of it, finding the target"
 CUT = "of it, reading all frames and cutting the target out"
 ESTIMATE = "of it, the estimate and its verdict"
 LEAST = "reading, cutting out, selecting the faces' beams and fitting once, all known before"
+BY_KERNELS = ", by kernels"
+_FIGURES = {
+    "world.reading": FIRST,
+    "world.find": FIND,
+    "world.cut": CUT,
+    "world.estimate": ESTIMATE,
+    "world.least": LEAST,
+    "world.kernels": KERNELS,
+    "world.kernels_find": FIND + BY_KERNELS,
+    "world.kernels_cut": CUT + BY_KERNELS,
+    "world.kernels_estimate": ESTIMATE + BY_KERNELS,
+    "world.kernels_least": LEAST + BY_KERNELS,
+}
 OPEN3D = "Open3D's `read_point_cloud` of the same frames"
 
 
@@ -71,9 +77,9 @@ def _calibrate(folder: Path, way: bool) -> object:
         return calibrate_world(read_corner_session(folder))
 
 
-def _parts(folder: Path) -> dict[str, Callable[[], object]]:
-    """The job's parts by NumPy alone; and what no way of doing it can leave out: reading all frames, a pass for cutting
-    out, one for selecting, and the last steps of the fit, with target, pose and noise known beforehand."""
+def _parts(folder: Path, way: bool) -> dict[str, Callable[[], object]]:
+    """The job's parts by NumPy alone, or by kernels; and what no way of doing it can leave out: reading all frames, a
+    pass for cutting out, one for selecting, and the last steps of the fit, all known beforehand."""
     session = read_corner_session(folder)
     located = locate_target(session)
     run = world_run(session, located=located)
@@ -86,7 +92,7 @@ def _parts(folder: Path) -> dict[str, Callable[[], object]]:
     def least() -> object:
         crops = gather(read_corner_session(folder), located.found)
         places, _ = observe(session, located.found, crops, corners, state.normals, sigma_m)
-        return fit_corner_model(places, state, sigma_m)
+        return fit_corner_model(places, state, sigma_m, near=True)
 
     works: dict[str, Callable[[], object]] = {
         FIND: lambda: find_target(session),
@@ -94,11 +100,11 @@ def _parts(folder: Path) -> dict[str, Callable[[], object]]:
         ESTIMATE: lambda: world_run(session, located=located),
         LEAST: least,
     }
-    return {name: partial(_by_numpy, work) for name, work in works.items()}
+    return {name + way * BY_KERNELS: partial(_by_one_way, work, way) for name, work in works.items()}
 
 
-def _by_numpy(work: Callable[[], object]) -> object:
-    with forced(False), one_blas_thread():
+def _by_one_way(work: Callable[[], object], way: bool) -> object:
+    with forced(way), one_blas_thread():
         return work()
 
 
