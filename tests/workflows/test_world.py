@@ -165,6 +165,18 @@ def test_a_height_that_is_wrong_is_not_passed_over(places: int, off_mm: float, o
     assert squared_error(result, truth) < 16.8
 
 
+def test_a_face_that_stands_elsewhere_where_no_corner_was_seen_is_named() -> None:
+    # Two faces of the place fit the others, and of three places alone nothing contradicts.
+    pose = Pose(paper_rotation(20.0, 15.0, 0.0), np.array([0.0, 0.0, 1.5]))
+    spec = CornerSceneSpec(pose=pose, places=4, frames=1, seed=10, target="cube", size_m=0.6, ground_m=0.0)
+    session, truth = simulate_corner_session(spec)
+    world = np.stack([p.corner_world for p in session.places])
+    world[2, 2] += 0.03
+    result = calibrate_world(with_world(session, world))
+    assert "p02" in reasons(result)
+    assert squared_error(result, truth) < 16.8
+
+
 def test_every_place_that_may_be_wrong_is_named_where_more_than_one_may() -> None:
     # Of four places whose corners lie nearly in one plane, without either of two the others fit.
     pose = Pose(paper_rotation(20.0, 15.0, 0.0), np.array([0.0, 0.0, 1.5]))

@@ -167,7 +167,7 @@ def _judge_open_crossing(verdict: _Verdict, possible: OpenCrossing, covariance: 
             "the beams rise by a VLP-16's odd degrees, all from one point, and the pose depends on it: those of a real "
             f"one cross {1e3 * MAKERS_CROSSING_M:.0f} mm before its axis, which its driver has then left out (the ROS "
             f"driver did until June 2023). State beam_crossing_m = {MAKERS_CROSSING_M:g} under [lidar] in session.toml "
-            "for clouds of a real one, 0 for simulated beams that start at one point; or take a box: its faces tell it"
+            "for clouds of a real one, 0 for simulated beams that start at one point"
         )
 
 

@@ -16,6 +16,7 @@ from lidarpose.detect.edge_corner import find_edge_corners
 from lidarpose.detect.trihedral_corner import FaceMask, find_corners
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
+from lidarpose.geometry.robust import median
 from lidarpose.geometry.threads import each
 from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import NEAR_RADIUS_M, CornerPlace, CornerSession, look_at_points
@@ -48,6 +49,8 @@ SETTLED_M, INNER_SETTLED_M = 5e-4, 3e-3
 # What is cut out around the faces as sighted: the fitted corner may be this far from the sighted one, but for a
 # sighting that is a fit itself.
 CROP_MARGIN_M, CLOSE_CROP_M = 0.15, 0.06
+# Of the beams towards a face, the share that has to end on one surface for that to be the face, elsewhere.
+SEEN_TOGETHER = 0.7
 GOLDEN = 0.6180339887498949
 
 Tick = Callable[[], None]
@@ -500,7 +503,9 @@ def observe(
         if k in found.strays:
             faces = {}
         elif sighting is None:
-            faces = _trusted(faces, crop, mask_of(reference, corner, normals), sigma_m)
+            mask = mask_of(reference, corner, normals)
+            faces = _trusted(faces, crop, mask, sigma_m)
+            left_out += _displaced(place.position, faces, crop, mask, sigma_m)
         if not faces:
             reason = found.strays.get(k, "no target where the other places put it")
             left_out.append(LeftOut(place.position, reason))
@@ -517,3 +522,30 @@ def _trusted(faces: dict[int, FaceReturns], crop: PlaceCrop, mask: FaceMask, sig
         j: f for j, f in faces.items() if len(f) > 0.6 * np.count_nonzero(face == j) and len(f) >= 3 * MIN_FACE_RETURNS
     }
     return kept if len(kept) >= 2 else {}
+
+
+def _displaced(
+    position: str, faces: Mapping[int, FaceReturns], crop: PlaceCrop, mask: FaceMask, sigma_m: float
+) -> list[LeftOut]:
+    """Faces of a place where no whole corner was seen whose beams end together, but not where the other places put
+    the face: where two faces fit, nothing else says that its coordinates are wrong."""
+    index, face = mask.select(crop.directions, crop.range_m, NEAR_RADIUS_M)
+    found = []
+    for j in (j for j in range(3) if faces and j not in faces):
+        mine = index[face == j]
+        if len(mine) < 3 * MIN_FACE_RETURNS:
+            continue
+        along = mask.normals[j] @ crop.rays.take(mine, axis=1)
+        off = crop.range_m[mine] * along - mask.normals[j] @ mask.corner
+        middle = median(off)
+        together = np.mean(np.abs(off - middle) < 3.0 * sigma_m)
+        if abs(middle) > 2.0 * sigma_m and together > SEEN_TOGETHER:
+            off_mm = 1e3 * abs(middle)
+            found.append(
+                LeftOut(
+                    f"face {j + 1} at {position}",
+                    f"its returns lie {off_mm:.0f} mm from where the other places put it: that place's coordinates may "
+                    "be off, or something else is seen there",
+                )
+            )
+    return found
