@@ -357,7 +357,7 @@ class FaceMask:
                 np.cumsum([0, *(len(least) for _, least in edges)]),
             ),
             (
-                np.array([[self._off_edge_m(j, k) for k in range(3)] for j in range(3)]),
+                self._off_edges_m,
                 planes,
                 np.array([[self._off_obstacle_m(j, plane) for plane in self.obstacles] for j in range(3)]).reshape(
                     3, -1
@@ -423,9 +423,11 @@ class FaceMask:
             return self.edges
         return [outline_edges(o, n) for o, n in zip(self.outlines, self.normals, strict=True)]
 
-    def _off_edge_m(self, face: int, other: int) -> float:
-        """How far a face's points have to be from another's plane to be off their common edge."""
-        return self.margin_m * float(np.linalg.norm(cross3(self.normals[face], self.normals[other])))
+    @cached_property
+    def _off_edges_m(self) -> FloatArray:
+        """How far each face's points have to be from another's plane (3, 3) to be off their common edge."""
+        cosines = self.normals @ self.normals.T
+        return np.asarray(self.margin_m * np.sqrt(np.maximum(1.0 - cosines**2, 0.0)))
 
     def _off_obstacle_m(self, face: int, plane: Plane) -> float:
         """How far a face's points have to be from what borders it."""
@@ -465,7 +467,7 @@ class FaceMask:
         good = (inward @ on_face > least[:, None] - RIM_M).all(axis=0)
         for k in range(3):
             if k != face:
-                good &= np.abs(height[k] - self.normals[k] @ self.corner) > self._off_edge_m(face, k)
+                good &= np.abs(height[k] - self.normals[k] @ self.corner) > self._off_edges_m[face, k]
         for plane in self.obstacles:
             good &= plane.normal @ on_face - plane.offset > self._off_obstacle_m(face, plane)
         return np.asarray(good)
