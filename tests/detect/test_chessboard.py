@@ -26,6 +26,9 @@ def test_both_panels_are_found_in_order_and_as_well_as_stated(two_panels) -> Non
         error = corners.pixels - true_pixels(two_panels, board)
         assert np.sqrt((error**2).mean()) < 0.04
         assert 0.7 < np.sqrt(((error / corners.sigma_px[:, None]) ** 2).mean()) < 1.3
+        columns = board.panel.columns
+        column, row = corners.pixels[[0, 1, columns, columns + 1]].mean(axis=0).round().astype(int)
+        assert corners.first_dark == (bright[row, column] < bright[bright > 0].mean())
 
 
 def test_a_board_that_moved_between_shots_is_named_with_its_shift(two_panels) -> None:

@@ -11,9 +11,12 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.observation import TurntableObservations
 from lidarpose.model.rig_family import Family
+from lidarpose.model.targets import Panel
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_result import TurntableEstimate
+from lidarpose.refine.hit_squares import SPOT_M, _darkness
 from lidarpose.refine.turntable import JointOptions, refine_turntable
+from lidarpose.simulate.board_pattern import is_black
 from lidarpose.simulate.observations import Blunders, simulate_observations
 from lidarpose.simulate.rig import TurntableRig, draw_rig
 from lidarpose.storage.calibration import read_turntable_calibration, write_calibration
@@ -222,6 +225,37 @@ def test_an_option_that_the_data_cannot_tell_is_refused() -> None:
     extra = {e.name: e for e in estimate.extras}["black_bias_m"]
     assert not extra.estimated
     assert "cannot tell" in extra.note
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_bias_on_black_squares_shows_without_intensities_where_the_squares_are_known(known: bool) -> None:
+    rig = draw_rig(2, places=20)
+    blunders = Blunders(black_range_bias_m=1e-3)
+    seen = simulate_observations(rig, stripe_step_px=20.0, seed=1, blunders=blunders)
+    places = tuple(
+        replace(p, scan_lines={k: replace(s, intensity=None) for k, s in p.scan_lines.items()}) for p in seen.places
+    )
+    first_dark = True if known else None
+    corners = {k: tuple(replace(c, first_dark=first_dark) for c in both) for k, both in seen.corners.items()}
+    estimate = refine(rig, replace(seen, places=places, corners=corners))
+    named = any("black squares" in reason for reason in estimate.quality.reasons)
+    assert named == known
+    if known:
+        extra = {e.name: e for e in estimate.extras}["black_bias_m"]
+        assert abs(extra.value - 1e-3) < 4.0 * extra.sigma
+        assert extra.value > 5e-4
+        assert errors(estimate, rig, float(rig.turntable_angle_rad.mean()))[2] < 22.5
+
+
+def test_squares_that_beams_hit_are_those_that_are_printed() -> None:
+    panel = Panel(7, 5, 0.03)
+    points = np.random.default_rng(1).uniform([-0.09, -0.09], [0.27, 0.21], (4000, 2))
+    darkness = _darkness(points / panel.square_m, panel.columns, panel.rows, True, SPOT_M / panel.square_m)
+    edge = np.abs((points / panel.square_m + 0.5) % 1.0 - 0.5).min(axis=1) * panel.square_m
+    clear = edge > SPOT_M
+    assert np.array_equal(darkness[clear] == 1.0, is_black(panel, points)[clear])
+    assert set(np.unique(darkness[clear])) == {0.0, 1.0}
+    assert np.all((darkness >= 0.0) & (darkness <= 1.0))
 
 
 def test_an_encoder_scale_enters_pose_and_covariance() -> None:

@@ -104,8 +104,12 @@ def find_panels(images: Sequence[GrayImage], panels: Sequence[Panel]) -> BoardDe
     found = [np.stack([shot[k] for shot in refined]) for k in range(len(panels))]
     shifts, used = _compare_shots(found)
     results = [_average(panel, pixels[used]) for panel, pixels in zip(panels, found, strict=True)]
+    first = images[int(np.flatnonzero(used)[0])]
     return BoardDetection(
-        corners=tuple(corners for corners, _ in results),
+        corners=tuple(
+            replace(corners, first_dark=_first_dark(first, panel, corners.pixels))
+            for (corners, _), panel in zip(results, panels, strict=True)
+        ),
         maps=tuple(fit.map for _, fit in results),
         shot_shift_px=shifts,
         shots_used=used,
@@ -230,6 +234,16 @@ def _average(panel: Panel, shots: FloatArray) -> tuple[PanelCorners, GridFit]:
     own = np.abs(fit.residuals_px).max(axis=1)
     each = np.where(fit.inliers, sigma, np.maximum(own, sigma))
     return PanelCorners(panel.corners_panel(), pixels, each), fit
+
+
+def _first_dark(image: GrayImage, panel: Panel, pixels: FloatArray) -> bool:
+    """Whether the square between the first corners is a black one, by the brightness in the middle of all squares."""
+    grid = pixels.reshape(panel.rows, panel.columns, 2)
+    middles = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
+    column, row = np.rint(middles).astype(int).transpose(2, 0, 1)
+    light = image[row.clip(0, image.shape[0] - 1), column.clip(0, image.shape[1] - 1)].astype(np.float64)
+    like_first = np.indices(light.shape).sum(axis=0) % 2 == 0
+    return bool(light[like_first].mean() < light[~like_first].mean())
 
 
 def _notes(shifts: FloatArray, used: BoolArray) -> tuple[str, ...]:

@@ -26,11 +26,14 @@ class PanelCorners:
         Where they are in the image, distorted pixels.
     sigma_px : (N,)
         Standard deviation of each coordinate, as detection states it.
+    first_dark
+        Whether the square from the panel's origin along x and y is a black one; None where nobody looked.
     """
 
     corners_panel: FloatArray
     pixels: FloatArray
     sigma_px: FloatArray
+    first_dark: bool | None = None
 
     def __post_init__(self) -> None:
         n = len(np.asarray(self.corners_panel))

@@ -15,6 +15,7 @@ from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_result import ExtraParameter, TurntableEstimate
 from lidarpose.refine.alternatives import duplicates, explain_by_alternative
 from lidarpose.refine.contradictions import explanations
+from lidarpose.refine.hit_squares import with_squares
 from lidarpose.refine.joint_options import JointOptions
 from lidarpose.refine.named_effect import paid_for, shift_of, strongest_effects, suggested
 from lidarpose.refine.observability import pose_spread, weak_directions, whole_turn
@@ -31,12 +32,15 @@ from lidarpose.refine.turntable_estimate import (
     tested_extras,
 )
 from lidarpose.refine.turntable_joint import Solution, solve_joint
-from lidarpose.refine.turntable_layout import lay_out
+from lidarpose.refine.turntable_layout import JointData, lay_out
 from lidarpose.refine.turntable_parameters import EXTRAS
-from lidarpose.refine.turntable_state import start_state
+from lidarpose.refine.turntable_state import JointState, start_state
 from lidarpose.refine.verdict import Evidence, judge
 
 __all__ = ["JointOptions", "refine_turntable"]
+
+# A share of beams that a start puts on squares of the other colour, which changes nothing.
+SAME_SQUARES = 0.02
 
 
 def refine_turntable(
@@ -67,18 +71,31 @@ def refine_turntable(
     data = lay_out(observations, use_stripes=options.use_stripes)
     start = start_state(data, start_motion, start_panel_poses)
     plain = replace(options, estimate=())
-    solution = solve_joint(data, start, plain)
+    solution = _solve(data, start, observations, plain)
     outside = outside_parameters(solution)
     _require_determined(observations, solution, outside, options)
     refused: dict[str, str] = {}
     if options.estimate:
         chosen, refused = _observable(solution, options)
         if chosen:
-            solution = solve_joint(data, solution.state, replace(options, estimate=chosen))
+            solution = solve_joint(solution.data, solution.state, replace(options, estimate=chosen))
             outside = outside_parameters(solution)
             require_determined(solution, outside)
         options = replace(options, estimate=chosen)
     return _assemble(observations, solution, outside, options, refused)
+
+
+def _solve(data: JointData, start: JointState, observations: TurntableObservations, options: JointOptions) -> Solution:
+    """The joint estimate without extra parameters. Without intensities, what beams hit is told by where they hit, and
+    the estimate made again where a rough start put that on other squares."""
+    if data.has_intensity:
+        return solve_joint(data, start, options)
+    ranges = with_squares(data, start, observations)
+    solution = solve_joint(replace(data, ranges=ranges), start, options)
+    again = with_squares(data, solution.state, observations)
+    if np.abs(again.darkness - ranges.darkness).mean() < SAME_SQUARES:
+        return solution
+    return solve_joint(replace(data, ranges=again), solution.state, options)
 
 
 def _require_determined(
