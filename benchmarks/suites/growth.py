@@ -19,7 +19,7 @@ from lidarpose.storage.corner_session import write_corner_session
 SIZES = {
     "places": (11, 22, 44, 87),
     "frames": (12, 30, 60, 120),
-    "points": (60_000, 200_000, 700_000, 2_000_000, 5_000_000),
+    "points": (60_000, 200_000, 700_000, 2_000_000, 3_200_000, 5_000_000),
     "assembled": (1_000_000, 4_000_000, 16_000_000),
     "written": (300_000, 1_500_000, 7_500_000),
 }
@@ -27,7 +27,9 @@ ROUNDS = {"places": 3, "frames": 9, "points": 5, "assembled": 5, "written": 5}
 # How places fall to processes differs from run to run, and what each of them holds at its peak with it.
 MEMORY_RUNS = {"places": 5}
 LEAST_MB = 1.0
-STOCK_MB = 5.0
+# What takes less than this, or than this share of what the largest size takes, is found in memory that the process has
+# in stock, and says nothing of growth.
+STOCK_MB, STOCK_SHARE = 5.0, 0.1
 WORK = {
     "places": "`calibrate`, turntable, places",
     "frames": "`calibrate`, world, frames",
@@ -65,12 +67,16 @@ def run(effort: Effort) -> Report:
     for name, values in sizes.items():
         seconds, memory = [median(one) for one in zip(*rounds[name], strict=True)], peaks[name]
         # Of each round by itself: its sizes ran one after the other, on a machine of one speed.
-        both = median(exponent(values, one) for one in rounds[name]), _memory_exponent(values, memory)
+        of_time = median(exponent(values, one) for one in rounds[name])
+        of_memory, first_told = memory_exponent(values, memory)
         if name in ("places", "frames", "points"):
-            figures |= {f"growth.{name}_s": both[0], f"growth.{name}_mb": both[1]}
+            figures |= {f"growth.{name}_s": of_time, f"growth.{name}_mb": of_memory}
+        if name == "points":
+            figures["growth.points_bytes"] = 1e6 * memory[-1] / values[-1]
         # Of next to nothing an exponent says nothing.
-        of_memory = f"{both[1]:.2f}" if memory[-1] > LEAST_MB else "-"
-        rows.append([WORK[name], f"{values[0]} to {values[-1]}", seconds[-1], f"{both[0]:.2f}", memory[-1], of_memory])
+        told = (f"{of_memory:.2f}", f"{first_told} to {values[-1]}") if memory[-1] > LEAST_MB else ("-", "-")
+        row = [WORK[name], f"{values[0]} to {values[-1]}", seconds[-1], f"{of_time:.2f}", memory[-1], *told]
+        rows.append(row)
         curves.append(
             Curve(
                 f"growth-{name}",
@@ -81,19 +87,24 @@ def run(effort: Effort) -> Report:
                 {"processor seconds": seconds, "MB above the input": memory},
             )
         )
-    columns = ["work", "sizes", "processor s at the last", "exponent", "MB at the last", "exponent"]
+    columns = ["work", "sizes", "processor s at the last", "exponent", "MB at the last", "exponent", "over sizes"]
     return Report(figures, [Table("Growth", columns, rows, _TEXT)], curves)
 
 
-def _memory_exponent(sizes: Sequence[float], memory: Sequence[float]) -> float:
-    """Of the sizes that take more than a few MB: less is found in what the process has in stock."""
-    told = [(size, mb) for size, mb in zip(sizes, memory, strict=True) if mb > STOCK_MB]
-    return exponent(*zip(*told, strict=True)) if len(told) > 1 else exponent(sizes, memory)
+def memory_exponent(sizes: Sequence[int], memory: Sequence[float]) -> tuple[float, int]:
+    """The exponent over those of the sizes, in ascending order, that take more than what a process has in stock, and
+    the least of these; over all if they are fewer than two."""
+    least = max(STOCK_MB, STOCK_SHARE * memory[-1])
+    told = [(size, mb) for size, mb in zip(sizes, memory, strict=True) if mb > least]
+    if len(told) < 2:
+        told = list(zip(sizes, memory, strict=True))
+    return exponent(*zip(*told, strict=True)), told[0][0]
 
 
 _TEXT = (
     "Processor time of all cores, all sizes in turn in one warm process; the exponent is the median of those of the "
     "rounds. Memory: each size in a process of its own, after a small one of the same kind, how far the process rises "
-    "above where it stood with its input in place (the turntable's and the world's input are files); sizes that take "
-    "less than 5 MB do not count for its exponent. Of places the median of five runs, as they are shared by processes."
+    "above where it stood with its input in place (the turntable's and the world's input are files); its exponent is "
+    "over the sizes named last: those that take less than 5 MB, or than a tenth of the largest, are found in what the "
+    "process has in stock. Of places the median of five runs, as they are shared by processes."
 )

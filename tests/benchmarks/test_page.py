@@ -2,12 +2,14 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 from benchmarks.limits import motion_bound, pose_limits
 from benchmarks.metrics import BY_KEY, METRICS, Metric
 from benchmarks.page import markdown, page
 from benchmarks.report import Curve, Report, Table
 from benchmarks.run import SUITES, compare
+from benchmarks.suites.growth import memory_exponent
 from benchmarks.timing import beside, exponent, interleaved, processor_seconds
 
 from lidarpose.simulate.rig import draw_rig
@@ -188,3 +190,13 @@ def test_the_bound_falls_with_more_data_and_without_noise() -> None:
     more = draw_rig(1, places=6, placements=3)
     with_stripe, without = (pose_limits(more, motion_bound(more, with_stripe=s), middle)[0] for s in (True, False))
     assert without > 2.0 * with_stripe
+
+
+def test_memory_in_stock_tells_nothing_of_growth() -> None:
+    slope, first = memory_exponent((10, 100, 1000, 3000), (0.5, 9.0, 100.0, 300.0))
+    assert slope == pytest.approx(1.0)
+    assert first == 1000
+    # What never takes much is fitted whole.
+    slope, first = memory_exponent((10, 100), (1.0, 4.0))
+    assert slope == pytest.approx(np.log10(4.0))
+    assert first == 10
