@@ -176,7 +176,8 @@ def test_the_turntables_own_covariance_reaches_the_world(recorded: Path) -> None
     known = found(TurntableCalibration(motion, factor @ factor.T))
     assert plain.covariance is not None
     assert known.covariance is not None
-    np.testing.assert_array_equal(known.T_world_source.matrix, plain.T_world_source.matrix)
+    # A process that has earned its kernels meanwhile adds in another order.
+    np.testing.assert_allclose(known.T_world_source.matrix, plain.T_world_source.matrix, atol=1e-12)
     added = known.covariance - plain.covariance
     moves = np.column_stack(
         [

@@ -103,7 +103,8 @@ def test_a_crossing_that_the_data_leave_open_is_in_the_covariance() -> None:
         assert stated.covariance is not None
         assert not any("VLP-16's" in reason for reason in stated.quality.reasons)
         assert np.linalg.eigvalsh(result.covariance - stated.covariance)[-1] > 0.0
-        np.testing.assert_array_equal(stated.T_world_source.matrix, result.T_world_source.matrix)
+        # A process that has earned its kernels meanwhile adds in another order.
+        np.testing.assert_allclose(stated.T_world_source.matrix, result.T_world_source.matrix, atol=1e-12)
     other = world_run(simulate_corner_session(replace(spec, lidar="hdl32"))[0]).calibration
     assert other.quality is not None
     assert other.quality.verdict == "good"
