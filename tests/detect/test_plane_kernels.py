@@ -1,10 +1,13 @@
 """The compiled passes over a cloud against NumPy's: the same patches, but for points within rounding of a gate."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from benchmarks.suites.plane_search import scene
 from scipy.spatial import cKDTree
 
+from lidarpose.detect import cloud_planes
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.geometry import compiled
 from lidarpose.geometry.arrays import FloatArray, angle_between, perpendicular_pair
@@ -57,6 +60,21 @@ def test_nearest_points_are_those_of_a_tree(n: int) -> None:
     points = np.random.default_rng(n).normal(size=(n, 3)).astype(np.float32)
     seeds = points[::7]
     np.testing.assert_array_equal(nearest(points, seeds, 12), cKDTree(points).query(seeds, k=12)[1])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_first_points_of_voxels_are_the_same(dtype: type[np.floating[Any]]) -> None:
+    from lidarpose.detect.patch_kernels import first_in_each
+
+    points = np.random.default_rng(4).normal(0.0, 0.5, (5000, 3)).astype(dtype)
+    expected = cloud_planes.first_in_each(points, 0.2)
+    np.testing.assert_array_equal(first_in_each(points, dtype(0.2)), expected)
+    assert 500 < len(expected) < 4500
+
+
+def test_patches_of_a_small_cloud_are_the_same() -> None:
+    points, _ = scene(6000, 0.05, 3)
+    assert_the_same(both_ways(points, PlaneSearch(from_sensor=True)))
 
 
 def test_eigenvalues_and_vectors_of_small_matrices() -> None:

@@ -50,6 +50,8 @@ DENSE_HYPOTHESES = 400
 FEWEST_OF_SAMPLE = 30
 # Neighbours of fewer seeds are found sooner than a thread is started.
 MANY_HYPOTHESES = 400
+# A whole refit is a kernel's in clouds of no more points: NumPy sorts more of them sooner.
+SMALL = 8000
 # So many distances are looked through by kernels sooner than a tree is built.
 FEW_DISTANCES = 400_000
 # So many voxels of the subsample tell whether a patch is a surface, and so many hypotheses' neighbourhoods.
@@ -542,7 +544,7 @@ def largest_component(points: Float32Array, inside: BoolArray, plane: Plane) -> 
 def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, component: BoolArray) -> PlanePatch | None:
     """The patch on the full cloud: free points near the plane in the cells that the component occupies."""
     seen = sample.points[component]
-    if sample.seeds is None and pays(0.0, KERNELS):
+    if sample.seeds is None and len(x) <= SMALL and pays(0.0, KERNELS):
         from lidarpose.detect.patch_kernels import refitted
 
         row = np.append(plane.normal, plane.offset)

@@ -242,7 +242,7 @@ def _sighting_compiled(
     )
     if side != int(reference.convex) or sizes.min() < 3 or np.linalg.norm(own - corner) > NEAR_M:
         return None
-    sigma_m = float(np.median(spreads[:3]))
+    sigma_m = float(np.sort(spreads[:3])[1])
     seen_at = edges.vertices + own
     least, gate_m = edges.least_at(own, RIM_M), 2.0 * GATE_SIGMAS * sigma_m
     wanted, there = in_view(

@@ -370,13 +370,13 @@ def improved(
 
 
 @kernel
-def _first_in_each(points: Any, side: float) -> Any:
-    """`cloud_planes.first_in_each` of points in single precision; empty where cells and numbers fit into no word."""
+def first_in_each(points: Any, side: Any) -> Any:
+    """`cloud_planes.first_in_each`, the side in the points' precision; empty where no word holds cell and number."""
     n = len(points)
     cells, low, high = np.empty((n, 3), np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
     for axis in range(3):
         for i in range(n):
-            cell = np.int64(np.floor(points[i, axis] / np.float32(side)))
+            cell = np.int64(np.floor(points[i, axis] / side))
             cells[i, axis] = cell
             low[axis] = cell if i == 0 else min(low[axis], cell)
             high[axis] = cell if i == 0 else max(high[axis], cell)
@@ -386,18 +386,25 @@ def _first_in_each(points: Any, side: float) -> Any:
     wide, deep = high[1] - low[1] + 1, high[2] - low[2] + 1
     if float(high[0] - low[0] + 1) * float(wide) * float(deep) * 2.0**bits > 2.0**62:
         return np.empty(0, np.int64)
-    words = np.empty(n, np.int64)
-    for i in range(n):
-        cell = ((cells[i, 0] - low[0]) * wide + (cells[i, 1] - low[1])) * deep + (cells[i, 2] - low[2])
-        words[i] = cell << bits | i
-    words.sort()
-    first = np.empty(n, np.int64)
+    # A table by the cells' hashed numbers; sorted are then the first points alone.
+    size = 1
+    while size < 2 * n:
+        size *= 2
+    table, words = np.full(size, -1, np.int64), np.empty(n, np.int64)
     kept = 0
     for i in range(n):
-        if i == 0 or words[i] >> bits != words[i - 1] >> bits:
-            first[kept] = words[i] & ((1 << bits) - 1)
+        cell = ((cells[i, 0] - low[0]) * wide + (cells[i, 1] - low[1])) * deep + (cells[i, 2] - low[2])
+        at = ((np.uint64(cell) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)) & np.uint64(size - 1)
+        while table[at] >= 0 and table[at] != cell:
+            at = (at + np.uint64(1)) & np.uint64(size - 1)
+        if table[at] < 0:
+            table[at] = cell
+            words[kept] = cell << bits | i
             kept += 1
-    return first[:kept]
+    first = np.sort(words[:kept])
+    for i in range(kept):
+        first[i] &= (1 << bits) - 1
+    return first
 
 
 @kernel
@@ -462,7 +469,7 @@ def _agree(points: Any, normal: Any, sigma: float, limits: Any, counts: Any) -> 
 def stands_out(local: Any, normal: Any, offset: float, sigma: float, gates: Any, limits: Any, counts: Any) -> int:
     """`cloud_planes._stands_out` with the neighbours asked: 1 or 0; -1 where points are too far apart for it."""
     points = local[:: max(len(local) // counts[2], 1)].copy()
-    first = _first_in_each(points, gates[0] * sigma)
+    first = first_in_each(points, np.float32(gates[0] * sigma))
     if len(first) == 0:
         return -1
     points = points[first]
