@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from benchmarks.peers import peer
 from benchmarks.report import Cell, Effort, Report, Table
 from benchmarks.suites.files import touched
 from benchmarks.timing import beside
+from lidarpose.detect.moved_points import moved_points
 from lidarpose.geometry.compiled import forced, installed
 from lidarpose.geometry.threads import one_blas_thread
 from lidarpose.model.corner_session import CornerSession
@@ -35,6 +38,8 @@ def run(effort: Effort) -> Report:
         ways = {FIRST: partial(_calibrate, folder, False), **_parts(folder, False), OPEN3D: _open3d_reading(folder)}
         if installed():
             ways |= {KERNELS: partial(_calibrate, folder, True), **_parts(folder, True)}
+            ways[MOVED] = partial(_by_one_way, partial(_moved, read_corner_session(folder)), True)
+        ways[BYTES] = partial(_bytes_alone, sorted(folder.rglob("*.pcd")))
         works = {name: way for name, way in ways.items() if way is not None}
         for work in (lambda: _read(read_corner_session(folder)), *works.values()):
             work()
@@ -57,6 +62,8 @@ CUT = "of it, reading all frames and cutting the target out"
 ESTIMATE = "of it, the estimate and its verdict"
 LEAST = "reading, cutting out, selecting the faces' beams and fitting once, all known before"
 BY_KERNELS = ", by kernels"
+MOVED = "of finding, a frame of each place read and what moved at three of them told, by kernels"
+BYTES = "of cutting, the files' bytes alone into memory that is used again, on all cores"
 _FIGURES = {
     "world.reading": FIRST,
     "world.find": FIND,
@@ -68,6 +75,8 @@ _FIGURES = {
     "world.kernels_cut": CUT + BY_KERNELS,
     "world.kernels_estimate": ESTIMATE + BY_KERNELS,
     "world.kernels_least": LEAST + BY_KERNELS,
+    "world.find_least": MOVED,
+    "world.cut_least": BYTES,
 }
 OPEN3D = "Open3D's `read_point_cloud` of the same frames"
 
@@ -106,6 +115,26 @@ def _parts(folder: Path, way: bool) -> dict[str, Callable[[], object]]:
 def _by_one_way(work: Callable[[], object], way: bool) -> object:
     with forced(way), one_blas_thread():
         return work()
+
+
+def _moved(session: CornerSession) -> object:
+    """What any finding by what moves begins with: no search, no fit."""
+    frames = [place.clouds[0].load().finite().points for place in session.places]
+    return moved_points(frames[:3])
+
+
+def _bytes_alone(paths: Sequence[Path]) -> None:
+    """What any cutting has to wait for, whatever it does with them."""
+    cores = os.cpu_count() or 1
+
+    def read(share: Sequence[Path]) -> None:
+        memory = bytearray(max((path.stat().st_size for path in share), default=0))
+        for path in share:
+            with path.open("rb", buffering=0) as file:
+                file.readinto(memory)
+
+    with ThreadPoolExecutor(cores) as pool:
+        list(pool.map(read, [paths[k::cores] for k in range(cores)]))
 
 
 def _open3d_reading(folder: Path) -> Callable[[], object] | None:
