@@ -19,7 +19,7 @@ from benchmarks.assemble import MOTION, recording
 from benchmarks.counting import calls, over_reference, peak_bytes
 from benchmarks.suites.plane_search import scene
 
-from lidarpose.detect import cloud_planes
+from lidarpose.detect import cloud_planes, patch_evidence, plane_sample
 from lidarpose.detect.chessboard import find_panels
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.detect.laser_stripe import StripeFinder
@@ -290,13 +290,14 @@ def all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def hypothesis_by_hypothesis(monkeypatch: pytest.MonkeyPatch) -> None:
     """Local planes one after the other in place of all at once."""
-    together = cloud_planes._local_planes
+    together = patch_evidence.local_planes_of
 
     def one_by_one(chosen: np.ndarray) -> object:
         parts = [together(one[None]) for one in chosen]
         return tuple(np.concatenate([part[k] for part in parts]) for k in range(2))
 
-    monkeypatch.setattr(cloud_planes, "_local_planes", one_by_one)
+    for module in (plane_sample, patch_evidence):
+        monkeypatch.setattr(module, "local_planes_of", one_by_one)
 
 
 def line_by_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ import pytest
 from benchmarks.suites.plane_search import scene
 from scipy.spatial import cKDTree
 
-from lidarpose.detect import cloud_planes
+from lidarpose.detect import patch_evidence
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.geometry import compiled
 from lidarpose.geometry.arrays import FloatArray, angle_between, perpendicular_pair
@@ -67,7 +67,7 @@ def test_the_first_points_of_voxels_are_the_same(dtype: type[np.floating[Any]]) 
     from lidarpose.detect.patch_kernels import first_in_each
 
     points = np.random.default_rng(4).normal(0.0, 0.5, (5000, 3)).astype(dtype)
-    expected = cloud_planes.first_in_each(points, 0.2)
+    expected = patch_evidence.first_in_each(points, 0.2)
     np.testing.assert_array_equal(first_in_each(points, dtype(0.2)), expected)
     assert 500 < len(expected) < 4500
 

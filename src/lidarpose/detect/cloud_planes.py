@@ -10,12 +10,26 @@ faces come up once the large ones are gone.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarpose.detect.patch_evidence import (
+    COUNTS,
+    GATE_SIGMAS,
+    GATES,
+    KERNELS,
+    LIMITS,
+    WIDEST,
+    Float32Array,
+    first_in_each,
+    is_thin,
+    moments,
+    moments_compiled,
+    spread,
+    stands_out,
+)
 from lidarpose.detect.plane_claims import Slab, patches_of_slabs
 from lidarpose.detect.plane_raster import (
     GAP_PER_RANGE,
@@ -24,82 +38,43 @@ from lidarpose.detect.plane_raster import (
     PlaneRaster,
     cell_size_m,
     grown,
-    mean_and_covariance,
     raster_of,
 )
-from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, perpendicular_pair
+from lidarpose.detect.plane_sample import (
+    POINTS_PER_HYPOTHESIS,
+    SAMPLE_SIZE,
+    PlaneSample,
+    draw_sample,
+    one_of_each,
+    shared_points,
+)
+from lidarpose.geometry.arrays import BoolArray, IntArray, perpendicular_pair
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.planes import Plane
-from lidarpose.geometry.robust import mad_sigma, quantile
 from lidarpose.model.plane_patch import PlanePatch
 
-Float32Array = NDArray[np.float32]
-Bits = NDArray[np.uint64]
-
-KERNELS = "detect.patch_kernels"
 # By how much they search a cloud sooner: its subsamples, and all points where a cloud is searched whole.
 SAVED_S = 1.5e-3
 SAVED_S_PER_POINT = 7e-8
-SAMPLE_SIZE = 4096
-# Distances of so many planes are looked at together as fit into a core's own memory.
-DISTANCES_AT_ONCE = 65_536
 # From this many points on, patches are found and tested in a subsample, and the whole cloud is asked once.
 DENSE = 200_000
 DENSE_SAMPLE = 8192
 DENSE_HYPOTHESES = 400
 FEWEST_OF_SAMPLE = 30
-# Neighbours of fewer seeds are found sooner than a thread is started.
-MANY_HYPOTHESES = 400
 # A whole refit is a kernel's in clouds of no more points: NumPy sorts more of them sooner.
 SMALL = 8000
-# So many distances are looked through by kernels sooner than a tree is built.
-FEW_DISTANCES = 400_000
-# So many voxels of the subsample tell whether a patch is a surface, and so many hypotheses' neighbourhoods.
+# So many voxels of the subsample tell whether a patch is a surface.
 ENOUGH_EVIDENCE = 1000
-ENOUGH_SEEDS = 12
 HYPOTHESES = 1000
-# Neighbourhoods of a hypothesis, in nearest points of the subsample and of a quarter of it: wide ones reach
-# across the gaps between the lines of a multi-beam LiDAR, narrow ones fit on small faces.
-NEIGHBOURHOODS = (10, 20)
-THINNED = 4
 # Of the hypotheses with most votes, how many are compared by their largest connected patch, and how often the best is
 # refitted on the subsample. In a dense cloud that is done on more points afterwards.
-RIVALS = 4
-REFITS = 3
-DENSE_RIVALS = 2
-DENSE_REFITS = 1
-POINTS_PER_HYPOTHESIS = 10
-# Of trees that are asked few times: wide leaves are built sooner.
-LEAF_SIZE = 32
-GATE_SIGMAS = 3.0
-MIN_SIGMA_M = 2e-4
-# A patch spreads more than its neighbourhoods say, by up to this factor; a wider slab would take in two surfaces.
-WIDEST = 3.0
+RIVALS_AND_REFITS = (4, 3)
+DENSE_RIVALS_AND_REFITS = (2, 1)
 # Patches that spread by this factor more than neighbouring points are of bent surfaces: flat ones spread up to twice as
 # much as the thinnest fifth of neighbourhoods, and none more than three times.
 BENT = 2.3
 # The share of the points found that patches of bent surfaces hold where those are wanted whole.
 BENT_SHARE = 1.0 / 3.0
-# Of the voxels within twice a patch's thickness, the share that lies within it; and its thickness over its width.
-STANDS_OUT = 0.7
-THIN = 0.15
-EVIDENCE_POINTS = 60_000
-# The second screening: neighbours that make a point's own normal, points asked, and how many have to agree how well.
-SCREENING_NEIGHBOURS = 12
-SCREENING_WIDTH = 1.5
-LINED_UP = 0.15
-SCREENED_POINTS = 200
-SCREENING_RAD = np.radians(25.0)
-SCREENED_SHARE = 0.55
-ASKED_SHARE = 0.35
-# Sine of the angle below which a surface counts as seen edge-on.
-EDGE_ON = 0.06
-# Of how many distances the spread is taken.
-SPREAD_POINTS = 20_000
-# What kernels need of these, by kind.
-_GATES = np.array([GATE_SIGMAS, WIDEST, MIN_SIGMA_M, STANDS_OUT, THIN])
-_LIMITS = np.array([SCREENING_WIDTH, LINED_UP, np.cos(SCREENING_RAD), ASKED_SHARE, SCREENED_SHARE])
-_COUNTS = np.array([SCREENING_NEIGHBOURS, SCREENED_POINTS, EVIDENCE_POINTS, SPREAD_POINTS])
 
 
 @dataclass(frozen=True)
@@ -129,37 +104,6 @@ class PlaneSearch:
     seed: int = 0
     hypotheses: int = HYPOTHESES
     bent: bool = False
-
-
-@dataclass(eq=False)
-class _Sample:
-    """A subsample with its hypotheses: planes (H, 4) as normal and offset, and who of S is near which, in bits (H, W).
-
-    For a dense cloud also what the neighbourhoods of all hypotheses say of the surfaces that they lie on.
-    """
-
-    indices: IntArray
-    points: Float32Array
-    planes: FloatArray
-    near: Bits
-    sigma_m: float
-    seeds: _Seeds | None = None
-    rivals: int = RIVALS
-    refits: int = REFITS
-
-
-@dataclass(frozen=True, eq=False)
-class _Seeds:
-    """Points (H, 3) and the normals (H, 3) that their neighbours give, where they give one."""
-
-    points: Float32Array
-    normals: FloatArray
-
-    def agree(self, on_patch: BoolArray, normal: FloatArray) -> bool | None:
-        """Whether the normals on a patch are mostly its own; None where too few know."""
-        if np.count_nonzero(on_patch) < ENOUGH_SEEDS:
-            return None
-        return _mostly_agree(self.normals[on_patch], normal)
 
 
 def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = None) -> tuple[PlanePatch, ...]:
@@ -195,8 +139,9 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
             found, near_m = _harvest_dense(x, free, count, sigma_m, search, least, at_most, rng)
         else:
             x = np.ascontiguousarray(x, dtype=np.float32)
-            sample = _draw(x, np.flatnonzero(free), sigma_m, search, rng)
-            sample.seeds = None
+            left = np.flatnonzero(free)
+            sample = draw_sample(x, left, sigma_m, search.hypotheses, rng, from_sensor=search.from_sensor)
+            sample = replace(sample, seeds=None)
             found, near_m = _harvest(x, free, sample, least, at_most), sample.sigma_m
         if not found:
             break
@@ -224,17 +169,16 @@ def _harvest_dense(
 ) -> tuple[list[PlanePatch], float]:
     """Patches of the `count` free points of a cloud so dense that a subsample shows them; the whole cloud is asked
     once for all of them. With them the spread of neighbouring points."""
-    chosen = _one_of_each(count, DENSE_SAMPLE, rng)
+    chosen = one_of_each(count, DENSE_SAMPLE, rng)
     if count < len(x):
         chosen = np.flatnonzero(free)[chosen]
     few = x[chosen].astype(np.float32)
     share = count / len(few)
     fewest = max(int(least / share), FEWEST_OF_SAMPLE)
-    jury = _one_of_each(len(few), SAMPLE_SIZE, rng)
-    fewer = replace(search, hypotheses=min(search.hypotheses, DENSE_HYPOTHESES))
-    sample = _draw(few, jury, sigma_m, fewer, rng)
-    sample.rivals, sample.refits = DENSE_RIVALS, DENSE_REFITS
-    seen = _harvest(few, np.ones(len(few), dtype=bool), sample, fewest, at_most)
+    jury = one_of_each(len(few), SAMPLE_SIZE, rng)
+    hypotheses = min(search.hypotheses, DENSE_HYPOTHESES)
+    sample = draw_sample(few, jury, sigma_m, hypotheses, rng, from_sensor=search.from_sensor)
+    seen = _harvest(few, np.ones(len(few), dtype=bool), sample, fewest, at_most, DENSE_RIVALS_AND_REFITS)
     slabs = [Slab.around(few[p.indices], p.plane, p.sigma_m) for p in seen]
     if not slabs:
         return [], sample.sigma_m
@@ -245,12 +189,12 @@ def _harvest_dense(
         if claim is None or len(claim.patch) < least:
             continue
         patch = claim.patch
-        if not _is_thin(np.append(0.0, claim.variances), patch.sigma_m):
+        if not is_thin(np.append(0.0, claim.variances), patch.sigma_m):
             continue
         # Few voxels of the subsample say little of what a patch is: the cloud has more.
         if len(first_in_each(few[before.indices], GATE_SIGMAS * before.sigma_m)) < ENOUGH_EVIDENCE:
             local = x[claim.around()].astype(np.float32)
-            if not _stands_out(local, patch.plane.normal, patch.plane.offset, patch.sigma_m):
+            if not stands_out(local, patch.plane.normal, patch.plane.offset, patch.sigma_m):
                 continue
         found.append(patch)
     if len(found) < at_most:
@@ -266,7 +210,7 @@ def _bent_patches(
 
     The planes stay as found: what is not flat to its noise has no optimum that a step from there leads to.
     """
-    chosen = _one_of_each(len(x), DENSE // 2, rng)
+    chosen = one_of_each(len(x), DENSE // 2, rng)
     few = x[chosen].astype(np.float32)
     fewest = max(int(least * len(few) / len(x)), FEWEST_OF_SAMPLE)
     seen = segment_planes(few, replace(search, min_points=fewest, min_share=0.0))
@@ -293,151 +237,14 @@ def _mostly_bent(patches: list[PlanePatch], near_m: float) -> bool:
     return bent > BENT_SHARE * sum(map(len, patches))
 
 
-def _one_of_each(count: int, parts: int, rng: np.random.Generator) -> IntArray:
-    """One number at random out of each of `parts` like stretches of [0, count): as even as the cloud's own order."""
-    if count <= parts:
-        return np.arange(count)
-    return np.asarray(((np.arange(parts) + rng.random(parts)) * (count / parts)).astype(np.int64))
-
-
-def _draw(
-    x: Float32Array, remaining: IntArray, sigma_m: float | None, search: PlaneSearch, rng: np.random.Generator
-) -> _Sample:
-    """Draw a subsample of the remaining points, and hypotheses around random points of it."""
-    if len(remaining) > SAMPLE_SIZE:
-        drawn = np.zeros(len(remaining), dtype=bool)
-        drawn[rng.integers(0, len(remaining), SAMPLE_SIZE)] = True
-        indices = remaining[drawn]
-    else:
-        indices = remaining
-    points = x[indices]
-    count = min(search.hypotheses, 4 * len(points))
-    thinned = points[rng.random(len(points)) < 1.0 / THINNED]
-    clouds = [points, thinned] if len(thinned) >= POINTS_PER_HYPOTHESIS else [points]
-    draws = [_Neighbourhoods.drawn(cloud, count // 2, rng) for cloud in clouds]
-    if count < MANY_HYPOTHESES:
-        chosen = np.concatenate([draw.points() for draw in draws])
-    else:
-        with ThreadPoolExecutor(1) as pool:
-            others = [pool.submit(draw.points) for draw in draws[1:]]
-            chosen = np.concatenate([draws[0].points(), *(other.result() for other in others)])
-    seeds = np.concatenate([draw.cloud[draw.seeds] for draw in draws])
-    planes, variances = _local_planes(chosen)
-    flat = variances[:, 1] > 0.01 * variances[:, 2]
-    if search.from_sensor:
-        flat &= np.abs(planes[:, 3]) > EDGE_ON * np.linalg.norm(chosen.mean(axis=1), axis=1)
-    thickness = np.sqrt(variances[:, 0] * POINTS_PER_HYPOTHESIS / (POINTS_PER_HYPOTHESIS - 3.0))
-    if sigma_m is None:
-        sigma_m = _noise_from_neighbourhoods(thickness[flat])
-    known = _has_normal(variances, sigma_m)
-    thin = flat & (thickness < 4.0 * sigma_m)
-    near = _near(points, planes[thin], GATE_SIGMAS * sigma_m)
-    return _Sample(indices, points, planes[thin], near, sigma_m, _Seeds(seeds[known], planes[known, :3]))
-
-
-def _near(points: Float32Array, planes: FloatArray, gate_m: float) -> Bits:
-    """Which points (S, 3) lie within the gate of which planes (H, 4), in bits (H, W)."""
-    if pays(0.0, KERNELS):
-        from lidarpose.detect.patch_kernels import near_bits
-
-        return np.asarray(near_bits(points, planes, float(gate_m))).view(np.uint64)
-    near = np.empty((len(planes), -(-len(points) // 64)), dtype=np.uint64)
-    rows, columns = planes.astype(np.float32), np.ascontiguousarray(points.T)
-    together = max(DISTANCES_AT_ONCE // max(len(points), 1), 1)
-    for first in range(0, len(planes), together):
-        some = rows[first : first + together]
-        distance = some[:, :3] @ columns
-        distance -= some[:, 3:]
-        np.abs(distance, out=distance)
-        near[first : first + together] = _bits(distance < np.float32(gate_m))
-    return near
-
-
-def _bits(flags: BoolArray) -> Bits:
-    """Flags (..., S) in words of 64 (..., W), the last filled up with zeros."""
-    packed = np.packbits(flags, axis=-1)
-    lacking = -packed.shape[-1] % 8
-    if lacking:
-        packed = np.concatenate([packed, np.zeros((*packed.shape[:-1], lacking), dtype=np.uint8)], axis=-1)
-    return packed.view(np.uint64)
-
-
-def _shared(near: Bits, flags: BoolArray) -> IntArray:
-    """How many (H,) of the flagged points (S,) are near each plane."""
-    both = near & _bits(flags)
-    if hasattr(np, "bitwise_count"):
-        return np.asarray(np.bitwise_count(both).sum(axis=1, dtype=np.int64))
-    return np.asarray(_BITS_OF_BYTE[both.view(np.uint8)].sum(axis=1, dtype=np.int64))  # NumPy 1
-
-
-_BITS_OF_BYTE = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
-class _Neighbourhoods:
-    """Random points `seeds` (H,) of a cloud (S, 3), and `shares` (H, K) of their nearest points, the nearest 0."""
-
-    cloud: Float32Array
-    seeds: IntArray
-    shares: FloatArray
-
-    @staticmethod
-    def drawn(cloud: Float32Array, count: int, rng: np.random.Generator) -> _Neighbourhoods:
-        return _Neighbourhoods(cloud, rng.integers(0, len(cloud), count), rng.random((count, POINTS_PER_HYPOTHESIS)))
-
-    def points(self) -> Float32Array:
-        """(H, K, 3), by turns from more and from fewer of the nearest."""
-        widest = min(NEIGHBOURHOODS[-1], len(self.cloud))
-        neighbours = self._nearest(widest)
-        reach = np.minimum(np.array(NEIGHBOURHOODS)[np.arange(len(self.seeds)) % len(NEIGHBOURHOODS)], widest)
-        picks = (self.shares * reach[:, None]).astype(np.int64)
-        return np.asarray(self.cloud[np.take_along_axis(neighbours, picks, axis=1)])
-
-    def _nearest(self, count: int) -> IntArray:
-        """Positions (H, count) of the points nearest to each seed, the nearest first."""
-        if len(self.seeds) * len(self.cloud) < FEW_DISTANCES and pays(0.0, KERNELS):
-            from lidarpose.detect.patch_kernels import nearest
-
-            return np.asarray(nearest(self.cloud, self.cloud[self.seeds], count))
-        from scipy.spatial import cKDTree
-
-        tree = cKDTree(self.cloud, LEAF_SIZE, compact_nodes=False, balanced_tree=False)
-        return np.asarray(tree.query(self.cloud[self.seeds], k=count)[1])
-
-
-def _local_planes(chosen: Float32Array) -> tuple[FloatArray, FloatArray]:
-    """Planes (H, 4) through neighbourhoods (H, K, 3), and the variances (H, 3) of their points, ascending."""
-    if pays(0.0, KERNELS):
-        from lidarpose.detect.patch_kernels import local_planes
-
-        planes, variances = local_planes(chosen)
-        return planes, variances
-    mean = chosen.mean(axis=1, dtype=np.float64)
-    d = chosen - mean[:, None, :]
-    values, vectors = np.linalg.eigh(d.swapaxes(1, 2) @ d / chosen.shape[1])
-    normals = vectors[:, :, 0]
-    planes = np.column_stack([normals, np.einsum("hi,hi->h", normals, mean)])
-    return planes, np.maximum(values, 0.0)
-
-
-def _has_normal(variances: FloatArray, sigma_m: float) -> BoolArray:
-    """Of neighbourhoods with variances (H, 3), which have a normal: wider than the noise, and not along a line."""
-    return (variances[:, 1] > (SCREENING_WIDTH * sigma_m) ** 2) & (variances[:, 1] > LINED_UP * variances[:, 2])
-
-
-def _mostly_agree(normals: FloatArray, normal: FloatArray) -> bool:
-    agree = np.abs(normals @ normal) > np.cos(SCREENING_RAD)
-    return bool(np.count_nonzero(agree) >= SCREENED_SHARE * len(agree))
-
-
-def _noise_from_neighbourhoods(thickness: FloatArray) -> float:
-    """The noise across flat neighbourhoods: of all, the thinnest fifth is flat almost surely."""
-    if len(thickness) == 0:
-        return MIN_SIGMA_M
-    return max(quantile(thickness, 0.2), MIN_SIGMA_M)
-
-
-def _harvest(x: Float32Array, free: BoolArray, sample: _Sample, least: int, at_most: int) -> list[PlanePatch]:
+def _harvest(
+    x: Float32Array,
+    free: BoolArray,
+    sample: PlaneSample,
+    least: int,
+    at_most: int,
+    rivals_and_refits: tuple[int, int] = RIVALS_AND_REFITS,
+) -> list[PlanePatch]:
     """Take the patches of one subsample, best first; their points are no longer `free`."""
     patches: list[PlanePatch] = []
     active = np.ones(len(sample.points), dtype=bool)
@@ -446,20 +253,20 @@ def _harvest(x: Float32Array, free: BoolArray, sample: _Sample, least: int, at_m
     least_sample = max(least / scale, 12.0)
     dead = np.zeros(len(sample.planes), dtype=bool)
     while len(patches) < at_most and not dead.all():
-        votes = _shared(sample.near, active).astype(np.float32)
+        votes = shared_points(sample.near, active).astype(np.float32)
         votes[dead] = -1.0
         if votes.max() < least_sample:
             break
-        candidate, component, hypothesis = _best_patch(sample, active, votes)
+        candidate, component, hypothesis = _best_patch(sample, active, votes, *rivals_and_refits)
         size = int(np.count_nonzero(component))
         if size < least_sample:
-            dead |= _shared(sample.near, component) > 0.5 * max(size, 1)
+            dead |= shared_points(sample.near, component) > 0.5 * max(size, 1)
             dead[hypothesis] = True
             continue
         patch = _refit(x, free, candidate, sample, component)
         if patch is None or len(patch) < least:
             dead[hypothesis] = True
-            dead |= _shared(sample.near, component) > 0.8 * size
+            dead |= shared_points(sample.near, component) > 0.8 * size
             # What looked most like a plane here and is none would look so from many sides: no more votes from it.
             active[component] = False
             continue
@@ -469,9 +276,11 @@ def _harvest(x: Float32Array, free: BoolArray, sample: _Sample, least: int, at_m
     return patches
 
 
-def _best_patch(sample: _Sample, active: BoolArray, votes: Float32Array) -> tuple[Plane, BoolArray, int]:
+def _best_patch(
+    sample: PlaneSample, active: BoolArray, votes: Float32Array, rivals: int, refits: int
+) -> tuple[Plane, BoolArray, int]:
     """Of the hypotheses with most votes the one whose largest connected patch is largest, optimised locally."""
-    leaders = np.argsort(-votes)[: 6 * sample.rivals : 6]
+    leaders = np.argsort(-votes)[: 6 * rivals : 6]
     best: tuple[int, Plane, BoolArray, int] | None = None
     for leader in leaders:
         if best is not None and votes[leader] <= best[0]:
@@ -490,10 +299,10 @@ def _best_patch(sample: _Sample, active: BoolArray, votes: Float32Array) -> tupl
 
         row, gate_m = np.append(plane.normal, plane.offset), GATE_SIGMAS * sample.sigma_m
         component = improved(
-            sample.points, active, component, row, gate_m, sample.refits, MIN_GAP_M, GAP_PER_RANGE, MOST_CELLS
+            sample.points, active, component, row, gate_m, refits, MIN_GAP_M, GAP_PER_RANGE, MOST_CELLS
         )
         return Plane(row[:3], float(row[3])), component, leader_index
-    for _ in range(sample.refits):
+    for _ in range(refits):
         if np.count_nonzero(component) < 6:
             break
         plane = _moment_plane(sample.points[component])
@@ -541,7 +350,9 @@ def largest_component(points: Float32Array, inside: BoolArray, plane: Plane) -> 
     return result
 
 
-def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, component: BoolArray) -> PlanePatch | None:
+def _refit(
+    x: Float32Array, free: BoolArray, plane: Plane, sample: PlaneSample, component: BoolArray
+) -> PlanePatch | None:
     """The patch on the full cloud: free points near the plane in the cells that the component occupies."""
     seen = sample.points[component]
     if sample.seeds is None and len(x) <= SMALL and pays(0.0, KERNELS):
@@ -549,7 +360,7 @@ def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, comp
 
         row = np.append(plane.normal, plane.offset)
         verdict, mine, spread_m = refitted(
-            x, free, seen, row, sample.sigma_m, _GATES, _LIMITS, _COUNTS, MIN_GAP_M, GAP_PER_RANGE, MOST_CELLS
+            x, free, seen, row, sample.sigma_m, GATES, LIMITS, COUNTS, MIN_GAP_M, GAP_PER_RANGE, MOST_CELLS
         )
         if verdict >= 0:
             return PlanePatch(Plane(row[:3], float(row[3])), mine, float(spread_m)) if verdict else None
@@ -564,20 +375,20 @@ def _refit(x: Float32Array, free: BoolArray, plane: Plane, sample: _Sample, comp
     if len(near) < 6:
         return None
     sigma_m, normal, offset = sample.sigma_m, plane.normal, plane.offset - float(plane.normal @ centre)
-    moments = _moments_compiled if pays(0.0, KERNELS) else _moments
+    moments_of = moments_compiled if pays(0.0, KERNELS) else moments
     for _ in range(3):
         distance = local @ normal.astype(np.float32) - np.float32(offset)
         inside = np.abs(distance) < np.float32(GATE_SIGMAS * sigma_m)
         if np.count_nonzero(inside) < 6:
             return None
-        normal, offset, variances = moments(local, inside)
-        sigma_m = _spread(distance[inside], sample.sigma_m)
+        normal, offset, variances = moments_of(local, inside)
+        sigma_m = spread(distance[inside], sample.sigma_m)
     agree = None
     if sample.seeds is not None:
         seeds = sample.seeds.points
         on_patch = np.abs((seeds - centre) @ normal - offset) < GATE_SIGMAS * sigma_m
         agree = sample.seeds.agree(on_patch & allowed[raster.cells(seeds)], normal)
-    if not _is_thin(variances, sigma_m) or not _stands_out(local, normal, offset, sigma_m, agree):
+    if not is_thin(variances, sigma_m) or not stands_out(local, normal, offset, sigma_m, agree):
         return None
     offset += float(normal @ centre)
     final = Plane(normal, offset) if offset <= 0.0 else Plane(-normal, -offset)
@@ -606,107 +417,3 @@ def _points_near(
     local = x[near]
     keep = allowed[raster.cells(local)]
     return near[keep], local[keep] - centre
-
-
-def _stands_out(
-    local: Float32Array, normal: FloatArray, offset: float, sigma_m: float, neighbours_agree: bool | None = None
-) -> bool:
-    """Whether a plane is more than a slab through something else: a scanner's mount, clutter, a dense blob.
-
-    Of the points (M, 3) around it, the slab has to hold most of what lies up to twice as far off, and to be thin
-    beside both its extents. One point a voxel counts: where beams crowd, as at the pole of a turntable, they are no
-    more evidence than elsewhere, and whatever lies there would look flat. Whether neighbours agree with the plane is
-    found out here if it is not known.
-    """
-    points = local[:: max(len(local) // EVIDENCE_POINTS, 1)]
-    points = points[first_in_each(points, GATE_SIGMAS * sigma_m)]
-    height = np.abs(points @ normal.astype(np.float32) - np.float32(offset))
-    inside = height < GATE_SIGMAS * sigma_m
-    around = height < 2.0 * GATE_SIGMAS * sigma_m
-    if np.count_nonzero(inside) < max(STANDS_OUT * np.count_nonzero(around), 4.0):
-        return False
-    variances = _variances(points, inside)
-    if not variances[0] < THIN**2 * variances[1]:
-        return False
-    return _neighbours_agree(points[around], normal, sigma_m) if neighbours_agree is None else neighbours_agree
-
-
-def _neighbours_agree(points: Float32Array, normal: FloatArray, sigma_m: float) -> bool:
-    """The corner paper's second screening, of a whole patch: whether the normals that points (V, 3) have by their own
-    neighbours are mostly the plane's. Neighbours along one scan line, no wider than the noise, have no normal; where
-    two thirds are such, nobody is asked."""
-    if len(points) <= SCREENING_NEIGHBOURS:
-        return True
-    seeds = points[:: -(-len(points) // SCREENED_POINTS)]
-    if pays(0.0, KERNELS):
-        from lidarpose.detect.patch_kernels import nearest
-
-        neighbours = nearest(points, seeds, SCREENING_NEIGHBOURS)
-    else:
-        from scipy.spatial import cKDTree
-
-        tree = cKDTree(points, LEAF_SIZE, compact_nodes=False, balanced_tree=False)
-        neighbours = tree.query(seeds, k=SCREENING_NEIGHBOURS)[1]
-    planes, variances = _local_planes(points[neighbours])
-    known = _has_normal(variances, sigma_m)
-    if np.count_nonzero(known) < ASKED_SHARE * len(known):
-        return True
-    return _mostly_agree(planes[known, :3], normal)
-
-
-def first_in_each(points: NDArray[np.floating], side_m: float) -> IntArray:
-    """The first point (V,) in each cube of the side that holds any of points (M, 3)."""
-    x, y, z = np.floor(points.T / points.dtype.type(side_m)).astype(np.int64)
-    y -= y.min()
-    z -= z.min()
-    cells = (x - x.min()) * (int(y.max()) + 1)
-    cells += y
-    cells *= int(z.max()) + 1
-    cells += z
-    # Cell and number of a point in one word, where they fit: sorting words is five times as quick as sorting numbers
-    # by cells.
-    bits = len(points).bit_length()
-    if int(cells.max()) >> (63 - bits):
-        return np.asarray(np.unique(cells, return_index=True)[1], dtype=np.int64)
-    words = np.sort((cells << bits) | np.arange(len(points)))
-    cells = words >> bits
-    first = np.append(True, cells[1:] != cells[:-1])
-    return np.asarray(words[first] & ((1 << bits) - 1), dtype=np.int64)
-
-
-def _moments(local: Float32Array, inside: BoolArray) -> tuple[FloatArray, float, FloatArray]:
-    """Normal, offset and variances (3,), ascending, of the points (M, 3) that are inside; near the origin, so that
-    single precision holds their moments."""
-    weight = inside.astype(np.float32)
-    count = float(np.count_nonzero(inside))
-    mean = (weight @ local).astype(np.float64) / count
-    second = ((local * weight[:, None]).T @ local).astype(np.float64) / count - np.outer(mean, mean)
-    variances, axes = np.linalg.eigh(second)
-    return axes[:, 0], float(axes[:, 0] @ mean), variances
-
-
-def _variances(points: Float32Array, inside: BoolArray) -> FloatArray:
-    """Of those of the points (M, 3) that are inside, ascending (3,)."""
-    if pays(0.0, KERNELS):
-        return _moments_compiled(points, inside)[2]
-    return np.asarray(np.linalg.eigvalsh(mean_and_covariance(points[inside])[1]))
-
-
-def _moments_compiled(local: Float32Array, inside: BoolArray) -> tuple[FloatArray, float, FloatArray]:
-    """`_moments` by kernels."""
-    from lidarpose.detect.patch_kernels import eigen, moments
-
-    mean, second = moments(local, inside.view(np.uint8))
-    variances, axes = eigen(second)
-    return axes[:, 0].copy(), float(axes[:, 0] @ mean), variances
-
-
-def _spread(distance: Float32Array, first_sigma_m: float) -> float:
-    """Robust spread of distances (M,) across a plane, within a factor of the subsample's."""
-    few = distance[:: max(len(distance) // SPREAD_POINTS, 1)]
-    return min(max(mad_sigma(few, centred=True), MIN_SIGMA_M, 0.5 * first_sigma_m), WIDEST * first_sigma_m)
-
-
-def _is_thin(variances: FloatArray, sigma_m: float) -> bool:
-    """Whether points with these variances extend both ways well beyond their spread across."""
-    return bool(sigma_m**2 < 0.35**2 * variances[1] and sigma_m**2 < 0.1**2 * variances[2])

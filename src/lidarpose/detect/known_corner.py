@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpose.detect.cloud_planes import PlaneSearch, first_in_each, largest_component, segment_planes
+from lidarpose.detect.cloud_planes import PlaneSearch, largest_component, segment_planes
 from lidarpose.detect.crop import inside_box
+from lidarpose.detect.patch_evidence import first_in_each
 from lidarpose.detect.plane_raster import mean_and_covariance
 from lidarpose.detect.trihedral_corner import (
     KERNELS,

@@ -434,7 +434,7 @@ def _cells_around(seen: Any, axes: Any, cell_m: float, most: int) -> Any:
 
 @kernel
 def _spread(distance: Any, inside: Any, few: int, least: float, first: float, widest: float) -> float:
-    """`cloud_planes._spread` of the distances (M,) that are inside."""
+    """`patch_evidence.spread` of the distances (M,) that are inside."""
     chosen = np.abs(distance[inside > 0])
     chosen = np.sort(chosen[:: max(len(chosen) // few, 1)])
     n = len(chosen)
@@ -444,7 +444,7 @@ def _spread(distance: Any, inside: Any, few: int, least: float, first: float, wi
 
 @kernel
 def _agree(points: Any, normal: Any, sigma: float, limits: Any, counts: Any) -> bool:
-    """`cloud_planes._neighbours_agree`."""
+    """`patch_evidence._neighbours_agree`."""
     neighbours, asked_points = counts[0], counts[1]
     if len(points) <= neighbours:
         return True
@@ -467,7 +467,7 @@ def _agree(points: Any, normal: Any, sigma: float, limits: Any, counts: Any) -> 
 
 @kernel
 def stands_out(local: Any, normal: Any, offset: float, sigma: float, gates: Any, limits: Any, counts: Any) -> int:
-    """`cloud_planes._stands_out` with the neighbours asked: 1 or 0; -1 where points are too far apart for it."""
+    """`patch_evidence.stands_out` with the neighbours asked: 1 or 0; -1 where points are too far apart for it."""
     points = local[:: max(len(local) // counts[2], 1)].copy()
     first = first_in_each(points, np.float32(gates[0] * sigma))
     if len(first) == 0:
@@ -554,7 +554,7 @@ def refitted(
 
 @kernel
 def near_bits(points: Any, planes: Any, gate: float) -> Any:
-    """`cloud_planes._near` as bytes (H, W), the number of points rounded up to words of 64."""
+    """`plane_sample._near` as bytes (H, W), the number of points rounded up to words of 64."""
     count = len(points)
     near = np.zeros((len(planes), (count + 63) // 64 * 8), np.uint8)
     x, y, z = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.float32)

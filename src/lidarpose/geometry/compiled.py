@@ -29,7 +29,7 @@ from typing import Any, TypeVar, cast
 
 # Seconds of a process: importing numba and loading some kernels; the same where they have to be compiled first.
 LOADING_S = 0.6
-COMPILING_S = 8.0
+COMPILING_S = 12.0
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
