@@ -19,6 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.circles import fit_circle2
+from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.lines import Line2
 from lidarpose.geometry.robust import mad_sigma, median, quantile, tukey_weights
 from lidarpose.model.observation import ScanLine
@@ -45,8 +46,14 @@ LARGEST_STEP_M = 0.012
 MOST_SWEEPS = 9
 # What scatters by more than this many times the noise is no line at all.
 LARGEST_SCATTER = 6.0
+# Chords of a curve bend by less than this from one to the next.
+LARGEST_BEND_RAD = math.radians(40.0)
 # Ranges finer than this are rounding, not noise.
 LEAST_SIGMA_M = 1e-7
+
+KERNELS = "detect.scan_line_kernels"
+# What they save of a scan of some hundred beams.
+SAVED_S_PER_SCAN = 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +82,11 @@ class Beams:
         return np.stack([np.cos(self.angle_rad), np.sin(self.angle_rad)])
 
     @cached_property
+    def points(self) -> FloatArray:
+        """Points (N, 2)."""
+        return np.asarray((self.range_m * self.rays).T)
+
+    @cached_property
     def weight_m(self) -> FloatArray:
         """Range times the root of the sweeps that count (N,): over the noise, an inverse range in units of sigma."""
         return np.asarray(self.range_m * np.sqrt(np.minimum(self.count, MOST_SWEEPS)))
@@ -90,6 +102,22 @@ class Beams:
             weight = self.weight_m * self.range_m / noise
             self._columns[noise] = self.rays * weight, self.weight_m / noise
         return self._columns[noise]
+
+    @cached_property
+    def polar(self) -> FloatArray:
+        """Directions, ranges, and the sweeps that count (4, N), as the kernels take them."""
+        return np.vstack([self.rays, self.range_m, np.minimum(self.count, MOST_SWEEPS)])
+
+    @cached_property
+    def _tables(self) -> dict[float, FloatArray]:
+        return {}
+
+    def table(self, noise: float) -> FloatArray:
+        """Columns and inverse ranges (3, N) in units of sigma, as the kernels take them."""
+        if noise not in self._tables:
+            rows, q = self.columns(noise)
+            self._tables[noise] = np.vstack([rows, q])
+        return self._tables[noise]
 
 
 def find_lines(scan: Scan, spec: LidarSpec | None = None) -> tuple[ScanLine, ...]:
@@ -110,6 +138,7 @@ def find_lines(scan: Scan, spec: LidarSpec | None = None) -> tuple[ScanLine, ...
     beams = merge_sweeps(scan)
     if len(beams) < LEAST_BEAMS:
         return ()
+    pays(SAVED_S_PER_SCAN, KERNELS)
     noise = range_noise(beams)
     stated = spec.range_sigma_m if spec is not None else None
     segments, curved = _segments(beams, noise)
@@ -127,8 +156,21 @@ def _segments(beams: Beams, noise: float) -> tuple[list[tuple[int, int]], list[t
     """Straight stretches [first, last) of beams, and curved ones, at a given noise."""
     curved: list[tuple[int, int]] = []
     pieces = _straight_runs(beams, noise)
+    if pieces and pays(0.0, KERNELS):
+        return _segments_compiled(beams, noise, pieces)
     segments = [segment for piece in pieces for segment in _split(beams, noise, *piece, curved)]
     return _merged(beams, noise, _away_from_curves(segments, curved)), curved
+
+
+def _segments_compiled(
+    beams: Beams, noise: float, pieces: list[tuple[int, int]]
+) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    from lidarpose.detect.scan_line_kernels import segments_of
+
+    limits = WINDOW, LEAST_BEAMS, SPLIT_GAIN, LEAST_DEVIATION
+    found = segments_of(beams.table(noise), beams.polar, np.array(pieces), noise, limits)
+    straight, curved = ([(first, last) for first, last in each.tolist()] for each in found)
+    return straight, curved
 
 
 def _fragmented(beams: Beams, noise: float, segments: list[tuple[int, int]], curved: list[tuple[int, int]]) -> bool:
@@ -144,9 +186,10 @@ def _touch(beams: Beams, noise: float, a: tuple[int, int], b: tuple[int, int]) -
     gap = b[0] - a[1]
     if gap > WINDOW:
         return False
-    ends = _points(beams, *a)[[-WINDOW // 2, -1]], _points(beams, *b)[[0, WINDOW // 2]]
-    spacing = max(float(np.linalg.norm(e[1] - e[0])) for e in ends) / (WINDOW // 2)
-    return float(np.linalg.norm(ends[1][0] - ends[0][1])) < (abs(gap) + 2) * spacing + 8.0 * noise
+    here, there = beams.points[a[0] : a[1]], beams.points[b[0] : b[1]]
+    ends = here[[-WINDOW // 2, -1]].tolist(), there[[0, WINDOW // 2]].tolist()
+    spacing = max(math.dist(*e) for e in ends) / (WINDOW // 2)
+    return math.dist(ends[1][0], ends[0][1]) < (abs(gap) + 2) * spacing + 8.0 * noise
 
 
 def _preferred(
@@ -258,6 +301,18 @@ def _straight_runs(beams: Beams, noise: float) -> list[tuple[int, int]]:
     n = len(beams)
     if n < WINDOW:
         return []
+    good = (_straight_compiled if pays(0.0, KERNELS) else _straight)(beams, noise)
+    # A long way without returns is a break, unless few beams return at all.
+    step = np.diff(beams.angle_rad)
+    far = step > max(40.0 * median(step), np.deg2rad(3.0))
+    good &= ~sliding_window_view(far, WINDOW - 1).any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
+    return [(int(a), int(b) + WINDOW - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _straight(beams: Beams, noise: float) -> BoolArray:
+    """Which windows (N - WINDOW + 1,) are straight within the noise."""
+    n = len(beams)
     weight = beams.range_m**2 * np.sqrt(np.minimum(beams.count, MOST_SWEEPS)) / noise
     angle = sliding_window_view(beams.angle_rad, WINDOW)
     middle = angle[:, WINDOW // 2, None]
@@ -274,13 +329,13 @@ def _straight_runs(beams: Beams, noise: float) -> list[tuple[int, int]]:
     det = np.maximum(cc * ss - cs * cs, 1e-300)
     chi2 = qq - (ss * qc * qc - 2 * cs * qc * qs + cc * qs * qs) / det
     # Five degrees of freedom: one good window in ten thousand is above this.
-    good = chi2 < 4.0 * (WINDOW - 2) + 6.0
-    # A long way without returns is a break, unless few beams return at all.
-    step = np.diff(beams.angle_rad)
-    far = step > max(40.0 * median(step), np.deg2rad(3.0))
-    good &= ~sliding_window_view(far, WINDOW - 1).any(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
-    return [(int(a), int(b) + WINDOW - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return np.asarray(chi2 < 4.0 * (WINDOW - 2) + 6.0)
+
+
+def _straight_compiled(beams: Beams, noise: float) -> BoolArray:
+    from lidarpose.detect.scan_line_kernels import straight
+
+    return np.asarray(straight(beams.table(noise), beams.polar, WINDOW))
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,7 +424,7 @@ def _best_cut(beams: Beams, noise: float, fit: _Fit) -> tuple[int, float, float]
 
 def _is_curved(beams: Beams, noise: float, first: int, last: int, chi2_two_lines: float) -> bool:
     """True where a circle explains the beams better than two lines do."""
-    points = _points(beams, first, last)
+    points = beams.points[first:last]
     try:
         circle = fit_circle2(points)
     except ValueError:
@@ -380,10 +435,6 @@ def _is_curved(beams: Beams, noise: float, first: int, last: int, chi2_two_lines
     along = circle.distance(points) / np.maximum(np.abs((outward * rays).sum(axis=1)), 0.2)
     chi2 = float(np.sum((along / noise) ** 2 * np.minimum(beams.count[first:last], MOST_SWEEPS)))
     return chi2 < chi2_two_lines
-
-
-def _points(beams: Beams, first: int, last: int) -> FloatArray:
-    return (beams.range_m[first:last] * beams.rays[:, first:last]).T
 
 
 def _merged(beams: Beams, noise: float, segments: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -418,8 +469,7 @@ def _on_one_line(beams: Beams, noise: float, a: tuple[int, int], b: tuple[int, i
 
 def _distance(beams: Beams, i: int, j: int) -> float:
     """Distance of two beams' points."""
-    (x, y), (p, q) = ((beams.range_m[k] * beams.rays[:, k]).tolist() for k in (i, j))
-    return math.hypot(x - p, y - q)
+    return math.dist(beams.points[i].tolist(), beams.points[j].tolist())
 
 
 def _without_curves(beams: Beams, noise: float, segments: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -427,17 +477,17 @@ def _without_curves(beams: Beams, noise: float, segments: list[tuple[int, int]])
     kept = [s for s in segments if s[1] - s[0] >= LEAST_BEAMS]
     if len(kept) < 3:
         return kept
-    ends = [_points(beams, *s)[[0, -1]] for s in kept]
+    ends = [beams.points[[first, last - 1]].tolist() for first, last in kept]
+    lengths = [math.dist(*e) for e in ends]
     bends = []
     for k in range(len(kept) - 1):
         touching = kept[k + 1][0] - kept[k][1] <= 2 * WINDOW
-        length = min(float(np.linalg.norm(e[1] - e[0])) for e in ends[k : k + 2])
-        touching = touching and float(np.linalg.norm(ends[k + 1][0] - ends[k][1])) < 0.3 * length + 5.0 * noise
-        a, b = ends[k][1] - ends[k][0], ends[k + 1][1] - ends[k + 1][0]
-        bend = float(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b))
-        bends.append(bend if touching and abs(bend) < np.deg2rad(40.0) else 0.0)
+        length = min(lengths[k : k + 2])
+        touching = touching and math.dist(ends[k + 1][0], ends[k][1]) < 0.3 * length + 5.0 * noise
+        (a, b), (c, d) = ([q - p for p, q in zip(*e, strict=True)] for e in ends[k : k + 2])
+        bend = math.atan2(a * d - b * c, a * c + b * d)
+        bends.append(bend if touching and abs(bend) < LARGEST_BEND_RAD else 0.0)
     curved: BoolArray = np.zeros(len(kept), dtype=bool)
-    lengths = [float(np.linalg.norm(e[1] - e[0])) for e in ends]
     for k in range(len(bends) - 1):
         # Chords of one curve are about equally long; a wall beside bits and pieces is not.
         alike = max(lengths[k : k + 3]) < 3.0 * min(lengths[k : k + 3])
@@ -448,6 +498,8 @@ def _without_curves(beams: Beams, noise: float, segments: list[tuple[int, int]])
 
 def _finished(beams: Beams, noise: float, stated: float | None, segment: tuple[int, int]) -> ScanLine | None:
     """Final robust fit: reach out to the ends, trim them, drop stray ranges, state the scatter."""
+    if pays(0.0, KERNELS):
+        return _finished_compiled(beams, noise, stated, segment)
     first, last = segment
     weights: FloatArray = np.ones(last - first)
     fit, scale = _fit(beams, noise, first, last), 1.0
@@ -474,13 +526,26 @@ def _finished(beams: Beams, noise: float, stated: float | None, segment: tuple[i
     scatter = np.sqrt((10.0 * noise**2 + residuals @ residuals) / (8.0 + len(index)))
     if scatter > LARGEST_SCATTER * noise:
         return None
-    sigma = max(scatter, stated) if stated is not None else scatter
     along = np.column_stack([r * np.cos(t), r * np.sin(t)]) @ line.direction
     reach = float(np.sqrt(np.sum((along - along.mean()) ** 2)))
     if not scatter * float(incidence.mean()) < LARGEST_DIRECTION_SIGMA_RAD * reach:
         return None
+    return _line(beams, index, float(scatter), stated)
+
+
+def _finished_compiled(beams: Beams, noise: float, stated: float | None, segment: tuple[int, int]) -> ScanLine | None:
+    from lidarpose.detect.scan_line_kernels import finished
+
+    limits = LEAST_BEAMS, LARGEST_SCATTER, float(LARGEST_DIRECTION_SIGMA_RAD)
+    index, scatter = finished(beams.table(noise), beams.polar, beams.count, segment, noise, limits)
+    return _line(beams, index, scatter, stated) if len(index) else None
+
+
+def _line(beams: Beams, index: IntArray, scatter: float, stated: float | None) -> ScanLine:
+    """The line of some beams, which scatter by so much."""
+    sigma = max(scatter, stated) if stated is not None else scatter
     intensity = None if beams.intensity is None else beams.intensity[index]
-    return ScanLine(t, r, sigma / np.sqrt(beams.count[index]), intensity)
+    return ScanLine(beams.angle_rad[index], beams.range_m[index], sigma / np.sqrt(beams.count[index]), intensity)
 
 
 def _trimmed(first: int, good: BoolArray) -> tuple[int, BoolArray]:
