@@ -8,7 +8,9 @@ from lidarpose.geometry.compiled import forced, installed
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.refine.direction_cells import DirectionGrid
 from lidarpose.refine.face_rims import without_rims
+from lidarpose.refine.face_screening import without_foreign_spots
 from lidarpose.refine.face_systems import FaceSums, face_sums, loss_factor
+from lidarpose.refine.spot_scatter import _spots_off
 
 pytestmark = pytest.mark.skipif(not installed(), reason="numba is not installed")
 
@@ -88,3 +90,47 @@ def test_the_same_rims_are_left_out() -> None:
     for before, plain, compiled in zip(found, *left, strict=True):
         np.testing.assert_array_equal(plain.faces[0].range_m, compiled.faces[0].range_m)
         assert 4000 < len(plain.faces[0]) < 0.97 * len(before.faces[0])
+
+
+@pytest.mark.parametrize("kind", ["clean", "strap", "turned", "rim", "sparse"])
+def test_the_same_foreign_spots_are_left_out(kind: str) -> None:
+    rng = np.random.default_rng(4)
+    corner = np.array([2.0, 0.1, 0.2])
+    normal = unit(np.array([-1.0, 0.2, 0.1]))
+    rays = np.stack([np.ones(6000), *rng.uniform(-0.15, 0.15, (2, 6000))], axis=1)
+    if kind == "sparse":
+        rays[:, 2] = 0.15 * np.round(rays[:, 2] / 0.05) / 3.0
+    rays = unit(rays)
+    met = unit(normal + [0.0, 0.04, 0.0]) if kind == "turned" else normal
+    range_m = (met @ corner) / (rays @ met) + SIGMA_M * rng.standard_normal(6000)
+    rim = np.abs(rays[:, 1] / rays[:, 0]) > 0.13
+    strap = (rays[:, 1] < -0.02) & (rays[:, 1] > -0.08)
+    range_m[strap] -= 0.03 * (kind in ("strap", "sparse"))
+    range_m[rim] += 0.03 * (kind == "rim")
+    face = FaceReturns(rays, range_m, np.sort(rng.integers(0, 8, 6000)))
+    left = []
+    for way in (False, True):
+        with forced(way):
+            left.append(without_foreign_spots(face, rim, normal, corner, SIGMA_M))
+    plain, compiled = left
+    np.testing.assert_array_equal(plain.range_m, compiled.range_m)
+    np.testing.assert_array_equal(plain.rays, compiled.rays)
+    np.testing.assert_array_equal(plain.frame, compiled.frame)
+    gone = ~np.isin(range_m, plain.range_m)
+    if kind in ("strap", "sparse"):
+        assert gone[strap].mean() > 0.9
+        assert gone[~strap & ~rim].mean() < 0.5
+    else:
+        # Scan lines lie so close that what is outside of the outline is not needed.
+        np.testing.assert_array_equal(gone, rim)
+
+
+def test_spots_scatter_alike_both_ways() -> None:
+    face = returns()
+    with forced(False):
+        squares, spots = _spots_off(face, NORMAL, CORNER, 4.0 * SIGMA_M)
+    with forced(True):
+        compiled, count = _spots_off(face, NORMAL, CORNER, 4.0 * SIGMA_M)
+    assert compiled == pytest.approx(squares, rel=1e-10)
+    assert count == spots
+    assert 0.6 < squares / SIGMA_M**2 / spots < 1.5

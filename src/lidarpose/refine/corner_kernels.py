@@ -88,21 +88,42 @@ def loss_powers(residual: Any, reach_m: float) -> Any:
     return first, second, fourth, fifth
 
 
+@summing_kernel
+def middle_of(rays: Any) -> Any:
+    """The unit direction (3,) of the sum of rays (3, N)."""
+    x, y, z = 0.0, 0.0, 0.0
+    for i in range(rays.shape[1]):
+        x += rays[0, i]
+        y += rays[1, i]
+        z += rays[2, i]
+    length = np.sqrt(x * x + y * y + z * z)
+    if not length > 0.0:
+        raise ValueError("a vector of length zero has no direction")
+    return x / length, y / length, z / length
+
+
 @kernel
-def grid_cells(rays: Any, axes: Any, scale: float) -> Any:
+def grid_cells(rays: Any, scale: float) -> Any:
     """The cell (N,) of a grid of angles that each ray (3, N) is in, and the grid's width; see `DirectionGrid`."""
+    a, b, c = middle_of(rays)
+    # Across it, as `perpendicular_pair` has it.
+    p, q, r = -b, a, 0.0
+    if abs(a) <= abs(b) and abs(a) <= abs(c):
+        p, q, r = 0.0, -c, b
+    elif abs(b) <= abs(c):
+        p, q, r = c, 0.0, -a
+    across = np.sqrt(p * p + q * q + r * r)
+    p, q, r = p / across, q / across, r / across
+    s, t, w = b * r - c * q, c * p - a * r, a * q - b * p
     x, y, z = rays[0], rays[1], rays[2]
     count = len(x)
     row, column = np.empty(count), np.empty(count)
-    a0, a1, a2 = axes[0, 0], axes[0, 1], axes[0, 2]
-    b0, b1, b2 = axes[1, 0], axes[1, 1], axes[1, 2]
-    c0, c1, c2 = axes[2, 0], axes[2, 1], axes[2, 2]
     least_row, least_column, most_column = np.inf, np.inf, -np.inf
     for i in range(count):
-        ahead = 1.0 + (a0 * x[i] + a1 * y[i] + a2 * z[i])
+        ahead = 1.0 + (a * x[i] + b * y[i] + c * z[i])
         share = scale / (ahead if ahead > 1e-12 else 1e-12)
-        u = (b0 * x[i] + b1 * y[i] + b2 * z[i]) * share
-        v = (c0 * x[i] + c1 * y[i] + c2 * z[i]) * share
+        u = (p * x[i] + q * y[i] + r * z[i]) * share
+        v = (s * x[i] + t * y[i] + w * z[i]) * share
         row[i], column[i] = u, v
         least_row = u if u < least_row else least_row
         least_column = v if v < least_column else least_column
@@ -113,6 +134,93 @@ def grid_cells(rays: Any, axes: Any, scale: float) -> Any:
     for i in range(count):
         cell[i] = (np.int64(row[i] - first_row) + 1) * width + np.int64(column[i] - first_column) + 1
     return cell, width
+
+
+@kernel
+def spots_off(rays: Any, range_m: Any, normal: Any, height: float, scale: float, most_m: float) -> Any:
+    """The sum of squared means of a face's residuals by cell of a grid of angles, times how many each has, and how many
+    cells have any; of rays (3, N) and ranges (N,), without residuals of `most_m` and more."""
+    cell, _ = grid_cells(rays, scale)
+    x, y, z = rays[0], rays[1], rays[2]
+    a, b, c = normal[0], normal[1], normal[2]
+    cells = cell.max() + 1
+    count, total = np.zeros(cells), np.zeros(cells)
+    for i in range(len(x)):
+        off = range_m[i] - height / (a * x[i] + b * y[i] + c * z[i])
+        if abs(off) < most_m:
+            count[cell[i]] += 1.0
+            total[cell[i]] += off
+    squares, spots = 0.0, 0
+    for k in range(cells):
+        if count[k] > 0.0:
+            squares += total[k] * total[k] / count[k]
+            spots += 1
+    return squares, spots
+
+
+@kernel
+def seen_on_face(rays: Any, range_m: Any, normal: Any, corner: Any, scale: float) -> Any:
+    """Of a face's returns: measured minus expected ranges (N,), how far each lies towards the corner (N,), and cells
+    (N,) and width of a grid of angles."""
+    cell, width = grid_cells(rays, scale)
+    x, y, z = rays[0], rays[1], rays[2]
+    a, b, c = normal[0], normal[1], normal[2]
+    p, q, r = corner[0], corner[1], corner[2]
+    height = a * p + b * q + c * r
+    residual, nearness = np.empty(len(x)), np.empty(len(x))
+    for i in range(len(x)):
+        residual[i] = range_m[i] - height / (a * x[i] + b * y[i] + c * z[i])
+        nearness[i] = p * x[i] + q * y[i] + r * z[i]
+    return residual, nearness, cell, width
+
+
+@kernel
+def sums_by_cell(residual: Any, cell: Any, sure: Any, cells: int) -> Any:
+    """By cell (M,): how many returns it holds, the sum of their residuals (N,), and how many of those that `sure` (K,)
+    names; and the residuals (K,) of these."""
+    count, total, mine = np.zeros(cells, np.int64), np.zeros(cells), np.zeros(cells, np.int64)
+    off = np.empty(len(sure))
+    for i in range(len(cell)):
+        count[cell[i]] += 1
+        total[cell[i]] += residual[i]
+    for k in range(len(sure)):
+        mine[cell[sure[k]]] += 1
+        off[k] = residual[sure[k]]
+    return count, total, mine, off
+
+
+@kernel
+def plane_by_cell(rays: Any, index: Any, residual: Any, cell: Any, cells: int, axes: Any, along: Any) -> Any:
+    """Normal equations (3, 3), (3,) of the plane of a face's returns, those that `index` (N,) names of rays (3, L); and
+    the sums (M, 3) of their derivatives by cell.
+
+    `axes` (3, 3) are the plane's normal and tangents, `along` (3,) the corner along them; `residual` and `cell` (N,)
+    are the named ones'.
+    """
+    normal, pull, by_cell = np.zeros((3, 3)), np.zeros(3), np.zeros((cells, 3))
+    height, by_u, by_v = along[0], along[1], along[2]
+    for k in range(len(index)):
+        i = index[k]
+        x, y, z = rays[0, i], rays[1, i], rays[2, i]
+        shift = 1.0 / (axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z)
+        expected = height * shift
+        u = (by_u - expected * (axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z)) * shift
+        v = (by_v - expected * (axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z)) * shift
+        off, m = residual[k], cell[k]
+        normal[0, 0] += shift * shift
+        normal[0, 1] += shift * u
+        normal[0, 2] += shift * v
+        normal[1, 1] += u * u
+        normal[1, 2] += u * v
+        normal[2, 2] += v * v
+        pull[0] += shift * off
+        pull[1] += u * off
+        pull[2] += v * off
+        by_cell[m, 0] += shift
+        by_cell[m, 1] += u
+        by_cell[m, 2] += v
+    normal[1, 0], normal[2, 0], normal[2, 1] = normal[0, 1], normal[0, 2], normal[1, 2]
+    return normal, pull, by_cell
 
 
 @kernel

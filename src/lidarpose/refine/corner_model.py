@@ -31,11 +31,10 @@ from lidarpose.refine.face_systems import (
     MIN_RETURNS,
     MIN_SIGMA_M,
     FaceSystem,
-    face_residuals,
     face_sums,
     loss_factor,
     solved,
-    some_of,
+    some_residuals,
     tangents,
     wide_enough,
     without_first,
@@ -192,9 +191,7 @@ def _wide_start(
 ) -> float:
     """A first scale under which a poor start loses no face, by some returns of each."""
     corners = start.corners(world)
-    return wide_enough(
-        sigma_m, [face_residuals(some_of(f), start.normals[j], corners[i]) for (i, j), f in faces.items()]
-    )
+    return wide_enough(sigma_m, [some_residuals(f, start.normals[j], corners[i]) for (i, j), f in faces.items()])
 
 
 def _collapsed(

@@ -29,15 +29,14 @@ class DirectionGrid:
 
         Angles from the middle are stereographic, twice the tangent of half the angle: a sixth too large at 70 degrees.
         """
-        middle = unit(rays.sum(axis=1))
-        axes = np.vstack([middle, *perpendicular_pair(middle)])
         scale = 2.0 / cell_rad
         if pays(SAVED_S_PER_RAY * rays.shape[1], "refine.corner_kernels"):
             from lidarpose.refine.corner_kernels import grid_cells
 
-            cell, width = grid_cells(rays, axes, scale)
+            cell, width = grid_cells(rays, scale)
             return DirectionGrid(cell, int(width))
-        local = axes @ rays
+        middle = unit(rays.sum(axis=1))
+        local = np.vstack([middle, *perpendicular_pair(middle)]) @ rays
         angles = local[1:]
         angles *= scale / np.maximum(1.0 + local[0], 1e-12)
         angles -= np.floor(angles.min(axis=1, keepdims=True))

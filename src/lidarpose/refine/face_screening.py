@@ -7,15 +7,15 @@ same, and sooner.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
+from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.robust import median
 from lidarpose.model.corner_result import FaceReturns
 from lidarpose.refine.direction_cells import DirectionGrid
-from lidarpose.refine.face_systems import face_residuals, face_rows
+from lidarpose.refine.face_systems import SAVED_S_PER_RETURN, face_residuals, face_rows, normal_and_tangents
 
 SPOT_RAD = np.radians(1.2)
 # Beams of a multi-beam LiDAR are off by about one sigma each, all frames alike: that is no reason to drop them.
@@ -28,6 +28,7 @@ MIN_SPOTS = 5
 DENSE_NEIGHBOURS = 5.0
 # The share of a face's returns, those next to the corner, that are surely its own.
 SURE_SHARE = 0.25
+KERNELS = "refine.corner_kernels"
 
 
 def without_foreign_spots(
@@ -49,22 +50,22 @@ def without_foreign_spots(
     All returns where nothing is foreign, or where the face as a whole is turned: that is for the estimate to say.
     """
     seen = _Seen.of(returns, normal, corner)
-    spots = None if _is_dense(seen) else _spots(seen)
+    spots = None if _is_dense(seen.count(), seen.width) else _spots(seen)
+    kept = np.arange(len(rim))
     # Where scan lines lie so close, none is needed outside of the outline to tell where the face ends.
     if spots is None or _is_rim_odd(seen.residual[rim] - spots.level_m, sigma_m, spots.spread_m):
-        inner = np.flatnonzero(~rim)
-        if len(inner) < len(rim):
-            returns, seen = returns.subset(inner), seen.subset(inner)
-        if len(inner) == 0:
-            return returns
+        kept = np.flatnonzero(~rim)
+        if len(kept) == 0:
+            return returns.subset(kept)
+        seen = seen.subset(kept) if len(kept) < len(rim) else seen
         spots = _spots(seen)
     odd = _odd(spots, sigma_m)
-    if not odd.any() or _is_turned(returns, seen, spots, normal, corner, sigma_m):
-        return returns
-    if _is_dense(seen):
-        # What is something else does not end where a spot does.
-        odd |= _sum_around(odd, seen.width) > 0
-    return returns.subset(np.flatnonzero(~odd[seen.cell]))
+    if odd.any() and not _is_turned(returns.rays, kept, seen, spots, normal, corner, sigma_m):
+        if _is_dense(spots.count, seen.width):
+            # What is something else does not end where a spot does.
+            odd |= _sum_around(odd, seen.width) > 0
+        kept = kept.take(np.flatnonzero(~odd.take(seen.cell)))
+    return returns if len(kept) == len(rim) else returns.subset(kept)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,20 +80,33 @@ class _Seen:
 
     @staticmethod
     def of(returns: FaceReturns, normal: FloatArray, corner: FloatArray) -> _Seen:
+        if pays(SAVED_S_PER_RETURN * len(returns), KERNELS):
+            from lidarpose.refine.corner_kernels import seen_on_face
+
+            range_m = np.ascontiguousarray(returns.range_m, dtype=np.float64)
+            residual, nearness, cell, width = seen_on_face(returns.rays, range_m, normal, corner, 2.0 / SPOT_RAD)
+            return _Seen(residual, nearness, cell, int(width))
         grid = DirectionGrid.of(returns.rays, SPOT_RAD)
         return _Seen(face_residuals(returns, normal, corner), corner @ returns.rays, grid.cell, grid.width)
 
     def subset(self, index: IntArray) -> _Seen:
         return _Seen(self.residual.take(index), self.nearness.take(index), self.cell.take(index), self.width)
 
-    @cached_property
     def count(self) -> IntArray:
         """How many returns each cell (M,) holds."""
         return np.bincount(self.cell)
 
-    def means(self, residual: FloatArray) -> FloatArray:
-        """Of each cell (M,)."""
-        return np.asarray(np.bincount(self.cell, residual) / np.maximum(self.count, 1))
+    def sums(self, sure: IntArray) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
+        """By cell (M,): how many returns it holds, the sum of what they are off by, and how many of those that `sure`
+        (K,) names; and what these are off by (K,)."""
+        if pays(SAVED_S_PER_RETURN * len(self.cell), KERNELS):
+            from lidarpose.refine.corner_kernels import sums_by_cell
+
+            count, total, mine, off = sums_by_cell(self.residual, self.cell, sure, int(self.cell.max()) + 1)
+            return count, total, mine, off
+        count = np.bincount(self.cell)
+        mine = np.bincount(self.cell.take(sure), minlength=len(count))
+        return count, np.asarray(np.bincount(self.cell, self.residual)), mine, self.residual.take(sure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,18 +120,18 @@ class _Spots:
     spread_m: float
 
 
-def _is_dense(seen: _Seen) -> bool:
+def _is_dense(count: IntArray, width: int) -> bool:
     """Whether scan lines lie closer than spots, so that most neighbours of a spot hold returns too."""
-    there = seen.count > 0
-    return float(_sum_around(there, seen.width)[there].mean()) > DENSE_NEIGHBOURS
+    there = count > 0
+    around = float(there @ _sum_around(there, width))
+    return around > DENSE_NEIGHBOURS * int(np.count_nonzero(there))
 
 
 def _spots(seen: _Seen) -> _Spots:
-    sure = _next_to_corner(seen.nearness)
-    level_m = median(seen.residual.take(sure))
-    mean = np.where(seen.count > 0, seen.means(seen.residual) - level_m, 0.0)
-    spread_m = _spread(mean, seen.count, np.bincount(seen.cell.take(sure), minlength=len(seen.count)))
-    return _Spots(mean, seen.count, level_m, spread_m)
+    count, total, mine, off = seen.sums(_next_to_corner(seen.nearness))
+    level_m = median(off)
+    mean = np.where(count > 0, total / np.maximum(count, 1) - level_m, 0.0)
+    return _Spots(mean, count, level_m, _spread(mean, count, mine))
 
 
 def _is_rim_odd(residual: FloatArray, sigma_m: float, spread_m: float) -> bool:
@@ -129,14 +143,33 @@ def _is_rim_odd(residual: FloatArray, sigma_m: float, spread_m: float) -> bool:
 
 
 def _is_turned(
-    returns: FaceReturns, seen: _Seen, spots: _Spots, normal: FloatArray, corner: FloatArray, sigma_m: float
+    rays: FloatArray,
+    kept: IntArray,
+    seen: _Seen,
+    spots: _Spots,
+    normal: FloatArray,
+    corner: FloatArray,
+    sigma_m: float,
 ) -> bool:
-    """Whether a plane of its own explains a face to the noise: then nothing on it is foreign."""
-    _, rows = face_rows(returns.rays, normal, corner)
+    """Whether a plane of its own explains a face to the noise: then nothing on it is foreign.
+
+    `seen` is what `kept` (N,) names of rays (3, L).
+    """
     residual = seen.residual - spots.level_m
+    if pays(SAVED_S_PER_RETURN * len(kept), KERNELS):
+        from lidarpose.refine.corner_kernels import plane_by_cell
+
+        axes = normal_and_tangents(normal)
+        information, pull, by_cell = plane_by_cell(
+            rays, kept, residual, seen.cell, len(spots.count), axes, axes @ corner
+        )
+    else:
+        _, rows = face_rows(rays.take(kept, axis=1), normal, corner)
+        information, pull = rows @ rows.T, rows @ residual
+        by_cell = np.stack([np.bincount(seen.cell, row) for row in rows], axis=1)
     # Rows in metres and metres by radian: all about one.
-    own = residual - np.linalg.lstsq(rows @ rows.T, rows @ residual, rcond=1e-12)[0] @ rows
-    return _only_noise(seen.means(own), seen.count, sigma_m)
+    own = by_cell @ np.linalg.lstsq(information, pull, rcond=1e-12)[0] / np.maximum(spots.count, 1)
+    return _only_noise(np.where(spots.count > 0, spots.mean - own, 0.0), spots.count, sigma_m)
 
 
 def _next_to_corner(nearness: FloatArray) -> IntArray:

@@ -97,9 +97,13 @@ def _tangents(x: float, y: float, z: float) -> FloatArray:
     return pair
 
 
+def normal_and_tangents(normal: FloatArray) -> FloatArray:
+    """A normal and its two tangents as rows (3, 3)."""
+    return _axes(*normal.tolist())
+
+
 @lru_cache(maxsize=64)
 def _axes(x: float, y: float, z: float) -> FloatArray:
-    """A normal and its tangents as rows (3, 3)."""
     axes = np.vstack([(x, y, z), _tangents(x, y, z).T])
     axes.setflags(write=False)
     return axes
@@ -112,7 +116,7 @@ def face_residuals(returns: FaceReturns, normal: FloatArray, corner: FloatArray)
 
 def face_rows(rays: FloatArray, normal: FloatArray, corner: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Expected ranges (N,), and their derivatives (3, N) by the plane's shift and two tilts about the corner."""
-    axes = _axes(*normal.tolist())
+    axes = normal_and_tangents(normal)
     rows = axes @ rays
     along = axes @ corner
     shift, tilts = np.divide(1.0, rows[0], out=rows[0]), rows[1:]
@@ -177,7 +181,7 @@ def _sums_compiled(
 ) -> FaceSums:
     from lidarpose.refine.corner_kernels import collapse
 
-    axes, count = _axes(*normal.tolist()), len(returns)
+    axes, count = normal_and_tangents(normal), len(returns)
     ends = np.array([0, count]) if starts is None else np.append(starts, count)
     residual, sums = np.empty(count), np.empty((len(ends) - 1, 10))
     range_m = np.ascontiguousarray(returns.range_m, dtype=np.float64)
@@ -212,10 +216,10 @@ def _powers(residual: FloatArray, reach_m: float) -> tuple[float, float, float, 
     return *sums, float(v2 @ v)
 
 
-def some_of(returns: FaceReturns) -> FaceReturns:
-    """About a thousand of the returns: enough for a first scale."""
-    step = len(returns) // ENOUGH
-    return returns if step < 2 else returns.subset(np.arange(0, len(returns), step))
+def some_residuals(returns: FaceReturns, normal: FloatArray, corner: FloatArray) -> FloatArray:
+    """`face_residuals` of about a thousand of the returns: enough for a first scale."""
+    step = max(len(returns) // ENOUGH, 1)
+    return np.asarray(returns.range_m[::step] - (normal @ corner) / (normal @ returns.rays[:, ::step]))
 
 
 def wide_enough(sigma_m: float, residuals: Sequence[FloatArray]) -> float:

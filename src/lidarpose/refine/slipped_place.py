@@ -24,7 +24,7 @@ from lidarpose.refine.corner_model import (
     corner_covariances,
     fit_corner_model,
 )
-from lidarpose.refine.face_systems import face_residuals, some_of
+from lidarpose.refine.face_systems import some_residuals
 
 # A turn of the target: far beyond chance (three degrees of freedom) and large enough to matter.
 TURN_STATISTIC, TURN_DEG = 30.0, 0.2
@@ -56,7 +56,7 @@ def loses_returns(fit: CornerFit, places: Sequence[CornerPlaceFaces]) -> bool:
     corners = fit.state.corners(fit.world)
     for place, corner in zip(places, corners, strict=True):
         for j, returns in place.faces.items():
-            off = np.abs(face_residuals(some_of(returns), fit.state.normals[j], corner))
+            off = np.abs(some_residuals(returns, fit.state.normals[j], corner))
             if np.count_nonzero(off < FITTING_SIGMAS * fit.range_sigma_m) < FITTING_SHARE * len(off):
                 return True
     return False

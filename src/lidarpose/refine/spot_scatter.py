@@ -14,10 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.compiled import pays
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.refine.corner_model import CornerFit, face_jacobians, reweighted
 from lidarpose.refine.direction_cells import DirectionGrid
-from lidarpose.refine.face_systems import face_residuals
+from lidarpose.refine.face_systems import SAVED_S_PER_RETURN, face_residuals
 
 CELL_RAD = np.radians(1.5)
 # Beams that are wider than this in standard deviations are no beams, and narrower ones do nothing.
@@ -41,15 +42,26 @@ def spot_scatter(fit: CornerFit, places: Sequence[CornerPlaceFaces]) -> dict[tup
     found = {}
     for i, place in enumerate(places):
         for j, returns in place.faces.items():
-            residual = face_residuals(returns, fit.state.normals[j], corners[i])
-            keep = np.flatnonzero(np.abs(residual) < 4.0 * fit.range_sigma_m)
-            # None: a place whose world coordinates are off by decimetres may stand by itself.
-            cell = DirectionGrid.of(returns.rays, CELL_RAD).cell.take(keep)
-            count = np.bincount(cell)
-            total = np.bincount(cell, residual.take(keep))
-            chi2 = float((total**2 / np.maximum(count, 1)).sum()) / fit.range_sigma_m**2
-            found[i, j] = SpotScatter(chi2, int(np.count_nonzero(count)))
+            squares, spots = _spots_off(returns, fit.state.normals[j], corners[i], 4.0 * fit.range_sigma_m)
+            found[i, j] = SpotScatter(squares / fit.range_sigma_m**2, spots)
     return found
+
+
+def _spots_off(returns: FaceReturns, normal: FloatArray, corner: FloatArray, most_m: float) -> tuple[float, int]:
+    """The sum over cells of squared mean residuals times their number, of those below `most_m`; and how many cells."""
+    if pays(2.0 * SAVED_S_PER_RETURN * len(returns), "refine.corner_kernels"):
+        from lidarpose.refine.corner_kernels import spots_off
+
+        range_m = np.ascontiguousarray(returns.range_m, dtype=np.float64)
+        squares, spots = spots_off(returns.rays, range_m, normal, float(normal @ corner), 2.0 / CELL_RAD, most_m)
+        return float(squares), int(spots)
+    residual = face_residuals(returns, normal, corner)
+    keep = np.flatnonzero(np.abs(residual) < most_m)
+    # None: a place whose world coordinates are off by decimetres may stand by itself.
+    cell = DirectionGrid.of(returns.rays, CELL_RAD).cell.take(keep)
+    count = np.bincount(cell)
+    total = np.bincount(cell, residual.take(keep))
+    return float((total**2 / np.maximum(count, 1)).sum()), int(np.count_nonzero(count))
 
 
 def common_error_factor(

@@ -124,7 +124,7 @@ class PlaceCrop:
             return self
         step = np.arange(most)
         index = ((step + step * GOLDEN % 1.0) * (count / most)).astype(np.int64)
-        return PlaceCrop(self.points[index], self.frame[index], self.frames)
+        return PlaceCrop(self.points.take(index, axis=0), self.frame.take(index), self.frames)
 
 
 def world_coordinates(session: CornerSession) -> FloatArray:
