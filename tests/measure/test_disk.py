@@ -6,20 +6,21 @@ import numpy as np
 import pytest
 
 from lidarpose.geometry.planes import Plane
-from lidarpose.measure.beams import Beams, beams_of, chosen_beams, fit_plane_to_ranges, range_noise
+from lidarpose.measure.beams import Beams, beams_of, fit_plane_to_ranges, range_noise
 from lidarpose.measure.disk import RoundMeasurement, circle_on_plane, measure_round, with_calibration
-from lidarpose.model.recording import SweepRecording
 from lidarpose.simulate.disk_scene import DiskScene, disk_pose, rig_motion, simulate_disk
 from lidarpose.simulate.sweep_scene import BeamModel
+from lidarpose.workflows.measuring import measure_disk, view_of_recording
+from tests_support.moved_calibrations import drawn, full_calibration, moved, stated
 
 MOTION = rig_motion()
 SCENE = DiskScene(tilt_deg=20.0, tilt_direction_deg=40.0, field_deg=(8.0, 9.0), beam=BeamModel(spot_m=0.003, rays=61))
 
 
-def measure(scene: DiskScene, seed: int) -> tuple[RoundMeasurement, SweepRecording]:
+def measure(scene: DiskScene, seed: int) -> RoundMeasurement:
     recording = simulate_disk(scene, MOTION, seed=seed)
     beams = beams_of(recording, MOTION)
-    return measure_round(beams, range_noise(beams.range_m), "disk")[0], recording
+    return measure_round(beams, range_noise(beams.range_m), "disk")[0]
 
 
 @pytest.mark.parametrize(
@@ -35,7 +36,7 @@ def measure(scene: DiskScene, seed: int) -> tuple[RoundMeasurement, SweepRecordi
     ids=["mean", "thin", "dropped", "strongest", "stand", "cover"],
 )
 def test_the_diameter_has_no_bias(change: DiskScene, limit_mm: float) -> None:
-    disk, _ = measure(change, seed=3)
+    disk = measure(change, seed=3)
     error_mm = 1e3 * (disk.diameter_m - change.diameter_m)
     assert abs(error_mm) < limit_mm
     assert abs(error_mm) < 4e3 * disk.sigma_m
@@ -48,33 +49,51 @@ def test_the_diameter_has_no_bias(change: DiskScene, limit_mm: float) -> None:
 
 
 def test_the_calibrations_share_is_that_of_sampled_calibrations() -> None:
-    disk, recording = measure(SCENE, seed=5)
-    rng = np.random.default_rng(0)
-    # The radius and the mounting, badly known: what distorts sizes.
-    root = np.diag([1e-3] * 3 + [1e-3] * 3 + [2e-3] + [4e-3] * 3)
-    stated = with_calibration(
-        disk, lambda change, index: chosen_beams(recording, MOTION, index, change), root @ root.T
-    ).calibration_sigma_m
-    radii = []
-    for _ in range(200):
-        change = root @ rng.normal(size=10)
-        support = disk.support
-        plane = fit_plane_to_ranges(
-            support.plane, chosen_beams(recording, MOTION, support.plane_index, change), np.inf
-        )[0]
-        radii.append(circle_on_plane(chosen_beams(recording, MOTION, support.edge_index, change), plane, support))
-    assert stated == pytest.approx(2.0 * np.std(radii), rel=0.15)
-    assert stated is not None
-    assert 1e-5 < stated < 2e-3
+    """Of all its parameters: the cloud is put together anew by each calibration, and the edge's beams are the same."""
+    calibration = full_calibration(MOTION)
+    scene = replace(SCENE, sweep_step_deg=0.1, beam_step_deg=0.125)
+    recording = stated(simulate_disk(scene, MOTION, seed=5), calibration)
+    view = view_of_recording(recording, calibration)
+    disk = measure_disk(view)[0]
+    support, radii = disk.support, []
+    for off in drawn(calibration, 40, seed=0):
+        beams = view_of_recording(recording, off).beams
+        plane = fit_plane_to_ranges(support.plane, beams.at(support.plane_index), np.inf)[0]
+        radii.append(circle_on_plane(beams.at(support.edge_index), plane, support))
+    share = disk.calibration_sigma_m
+    assert share == pytest.approx(2.0 * np.std(radii, ddof=1), rel=0.03)
+    assert view.moved is not None
+    assert view.covariance is not None
+    of_motion = np.zeros((14, 14))
+    of_motion[:10, :10] = view.covariance[:10, :10]
+    without = with_calibration(disk, view.moved, of_motion).calibration_sigma_m
+    assert share is not None
+    assert without is not None
+    assert 0.0 < without < 0.5 * share
 
 
-def test_chosen_beams_are_the_grids() -> None:
+@pytest.mark.parametrize("per_beam", [False, True])
+def test_chosen_beams_are_the_grids_of_a_moved_calibration(per_beam: bool) -> None:
     recording = simulate_disk(replace(SCENE, field_deg=(1.0, 1.0)), MOTION, seed=1)
-    grid = beams_of(recording, MOTION)
+    if per_beam:
+        readings = recording.turntable_angle_deg[:, None] + np.linspace(0.0, 0.1, recording.beams)
+        recording = replace(recording, turntable_angle_deg=readings)
+    calibration = full_calibration(MOTION)
+    change = 1e-3 * np.random.default_rng(2).normal(size=14)
+    expected = view_of_recording(recording, moved(calibration, change)).beams
+    view = view_of_recording(recording, calibration)
     index = np.array([3, 17, 101])
-    some = chosen_beams(recording, MOTION, index)
-    np.testing.assert_allclose(some.points, grid.at(index).points, atol=1e-12)
-    np.testing.assert_allclose(some.origin, grid.at(index).origin, atol=1e-12)
+    assert view.moved is not None
+    assert view.shifts is not None
+    some = view.moved(change, index)
+    np.testing.assert_allclose(some.points, expected.at(index).points, atol=3e-7)
+    np.testing.assert_allclose(some.origin, expected.at(index).origin, atol=1e-12)
+    np.testing.assert_allclose(some.direction, expected.at(index).direction, atol=1e-12)
+    for k, by in enumerate(np.moveaxis(view.shifts(index), 2, 0)):
+        step = 1e-5 * np.eye(14)[k]
+        # Derivatives of points take one reading a sweep where there is one a beam.
+        numeric = (view.moved(step, index).points - view.moved(-step, index).points) / 2e-5
+        np.testing.assert_allclose(by, numeric, atol=1e-3 if per_beam else 1e-7)
 
 
 def test_the_plane_of_ranges_is_unbiased_under_noise_along_the_beam() -> None:

@@ -10,6 +10,8 @@ from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
 from lidarpose.geometry.se3 import Pose, exp_so3, rotation_z
 from lidarpose.measure.assemble import beam_origins_and_directions
+from lidarpose.measure.point_sigma import shifting_parameters
+from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.turntable import TurntableMotion
 
@@ -60,17 +62,26 @@ def beams_of(recording: SweepRecording, motion: TurntableMotion) -> Beams:
 
 
 def chosen_beams(
-    recording: SweepRecording, motion: TurntableMotion, index: IntArray, change: FloatArray | None = None
+    recording: SweepRecording, calibration: TurntableCalibration, index: IntArray, change: FloatArray | None = None
 ) -> Beams:
-    """Beams (n,) of flat indices in the camera frame, after a small change (10,) of the motion's parameters.
+    """Beams (n,) of flat indices in the camera frame, after a small change (p,) of the calibration's parameters.
 
-    The change is in the order of `lidarpose.model.turntable.PARAMETER_NAMES`.
+    Parameters
+    ----------
+    recording, calibration
+        Angles and ranges put right by the calibration, and the calibration as it is in the file.
+    change
+        In the order of `lidarpose.measure.point_sigma.shifting_parameters`; None for none.
     """
-    change = np.zeros(10) if change is None else change
+    names = shifting_parameters(calibration)
+    change = np.zeros(len(names)) if change is None else change
+    further = dict(zip(names[10:], change[10:].tolist(), strict=True))
+    motion, own = calibration.motion, calibration.beams
     i, j = np.divmod(index, recording.beams)
     readings = recording.turntable_angle_deg
     angle = np.deg2rad(np.asarray(readings[i, j] if recording.has_reading_per_beam else readings[i], dtype=np.float64))
-    theta = recording.beam_angle_rad[j]
+    angle = angle + further.get("encoder_scale", 0.0) * (angle - motion.reading_origin_rad) / motion.reading_scale
+    theta = recording.beam_angle_rad[j] * (1.0 + further.get("beam_angle_scale", 0.0) / own.angle_scale)
     R_tl = exp_so3(change[7:10]) @ motion.T_turntable_lidar.rotation
     T_ct = Pose.exp(change[:6]) @ motion.T_camera_turntable
     turn = rotation_z(angle)
@@ -78,7 +89,9 @@ def chosen_beams(
     direction = T_ct.rotate((turn @ d[..., None])[..., 0])
     origin = T_ct @ (turn[..., 0] * (motion.radius_m + change[6]))
     r = np.asarray(recording.range_m.reshape(-1)[index], dtype=np.float64)
-    return Beams(origin, direction, np.where((r > 0.0) & (r < np.inf), r, np.nan))
+    stated = own.range_scale * np.where((r > 0.0) & (r < np.inf), r, np.nan)
+    r = (stated - further.get("range_offset_m", 0.0)) / (own.range_scale + further.get("range_scale", 0.0))
+    return Beams(origin, direction, r)
 
 
 def range_noise(range_m: FloatArray) -> float:

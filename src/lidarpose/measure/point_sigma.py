@@ -84,12 +84,17 @@ def point_shifts(
 
 
 def shifting_covariance(calibration: TurntableCalibration) -> FloatArray | None:
-    """Of the motion's ten parameters and those further ones that move points; None where there is none."""
+    """Of `shifting_parameters`; None where there is none."""
     if calibration.parameter_covariance is None:
         return None
-    names = calibration.parameter_names
-    at = [*range(10), *(names.index(name) for name in _MOVING if name in names)]
+    at = [calibration.parameter_names.index(name) for name in shifting_parameters(calibration)]
     return calibration.parameter_covariance[np.ix_(at, at)]
+
+
+def shifting_parameters(calibration: TurntableCalibration) -> tuple[str, ...]:
+    """Names of the motion's ten parameters and of those further ones of the calibration that move points."""
+    names = calibration.parameter_names
+    return (*names[:10], *(name for name in _MOVING if name in names))
 
 
 _MOVING = ("encoder_scale", "range_offset_m", "range_scale", "beam_angle_scale")

@@ -42,10 +42,9 @@ class MeasuringView:
         Of a range.
     sees_behind
         False if only the object's own points can be trusted: the cloud's viewpoint is not known.
-    covariance, moved
-        The calibration's covariance, and the beams of flat indices under a change of its parameters.
-    shifts, shift_covariance
-        How points of flat indices move with all of the calibration's parameters, and the covariance of these.
+    covariance, moved, shifts
+        The covariance of all of the calibration's parameters that move points, the beams of flat indices under a
+        change of these, and the derivative of points of flat indices by them.
     remarks
         What a person should know of it.
     """
@@ -57,7 +56,6 @@ class MeasuringView:
     covariance: FloatArray | None = None
     moved: Callable[[FloatArray, IntArray], Beams] | None = None
     shifts: PointShifts | None = None
-    shift_covariance: FloatArray | None = None
     remarks: tuple[str, ...] = ()
 
 
@@ -70,13 +68,11 @@ def view_of_recording(recording: SweepRecording, calibration: TurntableCalibrati
         If there are too few returns.
     """
     recording = in_true_angles(recording, calibration)
-    as_in_file = calibration
-    calibration = replace(calibration, motion=calibration.motion.in_true_angles)
 
     def moved(change: FloatArray, index: IntArray) -> Beams:
-        return chosen_beams(recording, calibration.motion, index, change)
+        return chosen_beams(recording, calibration, index, change)
 
-    beams = beams_of(recording, calibration.motion)
+    beams = beams_of(recording, calibration.motion.in_true_angles)
     caution = None if calibration.quality is None else calibration.quality.caution
     remarks: tuple[str, ...] = () if caution is None else (caution,)
     if calibration.motion_covariance is None:
@@ -89,10 +85,9 @@ def view_of_recording(recording: SweepRecording, calibration: TurntableCalibrati
         noise,
         "camera",
         True,
-        calibration.motion_covariance,
+        shifting_covariance(calibration),
         moved,
-        lambda index: point_shifts(beams.points.reshape(-1, 3)[index], index, recording, as_in_file),
-        shifting_covariance(as_in_file),
+        lambda index: point_shifts(beams.points.reshape(-1, 3)[index], index, recording, calibration),
         remarks,
     )
 
@@ -190,7 +185,7 @@ def measure_planes(view: MeasuringView, *, least_share: float = 0.002, seed: int
 def plane_angle_sigmas(view: MeasuringView, planes: Sequence[MeasuredPlane]) -> FloatArray:
     """Standard deviations (n, n) in degrees of the angles between measured planes, the calibration's share included."""
     points = view.beams.points.reshape(-1, 3)
-    return plane_angle_sigmas_deg(planes, points, view.shifts, view.shift_covariance)
+    return plane_angle_sigmas_deg(planes, points, view.shifts, view.covariance)
 
 
 def with_readings_between(recording: SweepRecording) -> SweepRecording:
