@@ -9,7 +9,7 @@ import tempfile
 from dataclasses import dataclass
 from statistics import median
 
-from lidarpose.geometry.compiled import installed
+from lidarpose.geometry.compiled import COMPILING_S, LOADING_S, installed
 
 _CALL = """
 import time
@@ -65,8 +65,9 @@ def in_words(first: FirstCall | None, work: str) -> str:
     if first is None:
         return "numba is not installed."
     return (
-        f"Kernels are taken where they pay (docs/architecture.md): {work} until they would have saved a process 0.6 s "
-        f"(8 s where none are stored yet), or from its first call where it imports numba itself. That call then takes "
+        f"Kernels are taken where they pay (docs/architecture.md): {work} until they would have saved a process "
+        f"{LOADING_S} s ({COMPILING_S:.0f} s where none are stored yet), or from its first call where it imports "
+        f"numba itself. That call then takes "
         f"{first.stored_s:.2f} s more, and {first.compiled_s:.1f} s more where it is the first on a machine, which "
         f"compiles and stores them."
     )
