@@ -421,7 +421,7 @@ class FaceMask:
         """By face: its outline's edges."""
         if self.edges is not None:
             return self.edges
-        return [outline_edges(o, n) for o, n in zip(self.outlines, self.normals, strict=True)]
+        return outlines_edges(self.outlines, self.normals)
 
     @cached_property
     def _off_edges_m(self) -> FloatArray:
@@ -475,13 +475,28 @@ class FaceMask:
 
 def outline_edges(outline: FloatArray, normal: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Unit directions (E, 3) inward from an outline's edges, and how far along each its points lie at least (E,)."""
-    x, y, z = (np.concatenate([outline[1:], outline[:1]]) - outline).T
-    a, b, c = normal
+    return outlines_edges([outline], normal[None])[0]
+
+
+def outlines_edges(outlines: Sequence[FloatArray], normals: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """`outline_edges` of several outlines with their normals (F, 3)."""
+    count = [len(outline) for outline in outlines]
+    points = np.concatenate(outlines)
+    ends = np.cumsum(count)
+    following = np.arange(1, len(points) + 1)
+    following[ends - 1] = ends - count
+    x, y, z = (points.take(following, axis=0) - points).T
+    a, b, c = normals.repeat(count, axis=0).T
     inward = np.column_stack([b * z - c * y, c * x - a * z, a * y - b * x])
     length = np.sqrt(np.einsum("ij,ij->i", inward, inward))
-    keep = np.flatnonzero(length > 1e-9)
-    inward = inward.take(keep, axis=0) / length.take(keep)[:, None]
-    return inward, np.einsum("ij,ij->i", inward, outline.take(keep, axis=0))
+    keep = length > 1e-9
+    inward /= np.where(keep, length, 1.0)[:, None]
+    least = np.einsum("ij,ij->i", inward, points)
+    found = [(inward[end - many : end], least[end - many : end]) for end, many in zip(ends, count, strict=True)]
+    if keep.all():
+        return found
+    kept = [keep[end - many : end] for end, many in zip(ends, count, strict=True)]
+    return [(edges[mine], low[mine]) for (edges, low), mine in zip(found, kept, strict=True)]
 
 
 def in_outline(points: FloatArray, outline: FloatArray, normal: FloatArray, slack_m: float) -> BoolArray:

@@ -15,8 +15,7 @@ import numpy as np
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.rings import tangent_of_elevation
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
-from lidarpose.refine.corner_model import CornerFit, face_jacobians
-from lidarpose.refine.face_systems import weighted_rows
+from lidarpose.refine.corner_model import CornerFit
 from lidarpose.refine.ring_offsets import RingEquations, Rings, ring_equations
 
 # So many standard deviations are no chance; what edges and mixed pixels do to faces passes for some millimetres.
@@ -163,16 +162,14 @@ def seen_crossing(
     if not equations.determined:
         return None
     count, n = len(rings.elevation_rad), len(equations.pull)
-    corners = fit.state.corners(fit.world)
-    jacobians = face_jacobians(list(rings.numbers), fit.state, fit.world, fit.options)
     own, pull, crossed = 0.0, 0.0, np.zeros(n + count)
     for (i, j), ring in rings.numbers.items():
         returns, normal = places[i].faces[j], fit.state.normals[j]
-        residual, rows, weight = weighted_rows(returns, normal, corners[i], fit.range_sigma_m)
+        residual, rows, weight = equations.weighted[i, j]
         by = _by_crossing(returns, normal)
         own += float(weight @ by**2)
         pull += float(weight @ (by * residual))
-        crossed[:n] += jacobians[i, j].T @ (rows @ (weight * by))
+        crossed[:n] += equations.jacobians[i, j].T @ (rows @ (weight * by))
         crossed[n:] += np.bincount(ring, weight * by, count)
     prior = common_error / max(ring_sigma_m, _LEAST_RING_SIGMA_M) ** 2
     others = np.block([[equations.parameters, equations.cross], [equations.cross.T, np.diag(equations.rings + prior)]])

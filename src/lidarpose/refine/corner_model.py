@@ -20,13 +20,13 @@ from functools import cached_property
 
 import numpy as np
 
-from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import BoolArray, FloatArray, unit
 from lidarpose.geometry.robust import mad_sigma
 from lidarpose.geometry.se3 import Pose, exp_so3, skew
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.refine.face_systems import (
     FOLLOWED,
+    LEAST_TOLD,
     MAX_STEPS,
     MIN_RETURNS,
     MIN_SIGMA_M,
@@ -37,7 +37,6 @@ from lidarpose.refine.face_systems import (
     some_residuals,
     tangents,
     wide_enough,
-    without_first,
 )
 
 # What is left to go after the last step, in standard deviations.
@@ -362,22 +361,27 @@ def place_discrepancies(fit: CornerFit) -> tuple[FloatArray, FloatArray, BoolArr
 def own_turns(fit: CornerFit) -> dict[int, tuple[float, float]]:
     """By place with three faces: how far its own planes are tilted against the common ones, at most, in radians, and
     a chi-square of six degrees of freedom. One step from the common planes, on all returns that met them."""
-    found = {}
-    for place in range(len(fit.world)):
-        systems = [fit.systems.get((place, j)) for j in range(3)]
-        tilts, total = [], 0.0
-        for system in systems:
-            if system is None:
-                break
-            try:
-                tilt = solved(system.information, system.gradient, "a face")[1:]
-            except UndeterminedError:
-                break
-            tilts.append(float(np.linalg.norm(tilt)))
-            total += float(tilt @ without_first(system.information) @ tilt)
-        if len(tilts) == 3:
-            found[place] = max(tilts), total
-    return found
+    places = [p for p in range(len(fit.world)) if all((p, j) in fit.systems for j in range(3))]
+    systems = [fit.systems[p, j] for p in places for j in range(3)]
+    if not systems:
+        return {}
+    information = np.array([system.information for system in systems])
+    gradient = np.array([system.gradient for system in systems])
+    # As `solved` has it, for all faces together.
+    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), 1e-300))
+    scaled = information / (scale[:, :, None] * scale[:, None, :])
+    told = np.isfinite(scaled).all(axis=(1, 2))
+    scaled[~told] = np.eye(3)
+    told &= np.linalg.eigvalsh(scaled)[:, 0] >= LEAST_TOLD
+    scaled[~told] = np.eye(3)
+    tilt = (np.linalg.solve(scaled, (gradient / scale)[..., None])[..., 0] / scale)[:, 1:]
+    cross = information[:, 1:, 0]
+    free = information[:, 1:, 1:] - cross[:, :, None] * (cross / np.maximum(information[:, :1, 0], 1e-300))[:, None, :]
+    statistic = np.einsum("ki,kij,kj->k", tilt, free, tilt).reshape(-1, 3)
+    largest = np.linalg.norm(tilt, axis=1).reshape(-1, 3).max(axis=1)
+    known = told.reshape(-1, 3).all(axis=1)
+    turns = zip(largest.tolist(), statistic.sum(axis=1).tolist(), strict=True)
+    return {place: turn for place, turn, good in zip(places, turns, known, strict=True) if good}
 
 
 def corner_covariances(fit: CornerFit) -> FloatArray:

@@ -24,6 +24,8 @@ TUKEY_K = 6.0
 # made longer by it, which leaves a hundredth of the way where weights alone would leave a ninth.
 FOLLOWED = (1.0 - 6.0 / TUKEY_K**2 + 15.0 / TUKEY_K**4) / (1.0 - 2.0 / TUKEY_K**2 + 3.0 / TUKEY_K**4)
 MIN_RETURNS = 3
+# Normal equations, scaled, with a smaller eigenvalue determine nothing.
+LEAST_TOLD = 1e-10
 MIN_SIGMA_M = 1e-6
 MAX_STEPS = 50
 # So many returns of a face tell how wide the loss has to be at first.
@@ -81,6 +83,8 @@ class FaceSums:
     @property
     def system(self) -> FaceSystem:
         """All parts together."""
+        if len(self.used) == 1:
+            return FaceSystem(self.information[0], self.gradient[0])
         return FaceSystem(self.information.sum(axis=0), self.gradient.sum(axis=0))
 
 
@@ -182,7 +186,7 @@ def _sums_compiled(
     from lidarpose.refine.corner_kernels import collapse
 
     axes, count = normal_and_tangents(normal), len(returns)
-    ends = np.array([0, count]) if starts is None else np.append(starts, count)
+    ends = np.array([0, count] if starts is None else [*starts.tolist(), count])
     residual, sums = np.empty(count), np.empty((len(ends) - 1, 10))
     range_m = np.ascontiguousarray(returns.range_m, dtype=np.float64)
     collapse(returns.rays, range_m, ends, axes, axes @ corner, TUKEY_K * sigma_m, residual, sums)
@@ -237,7 +241,7 @@ def solved(information: FloatArray, gradient: FloatArray, what: str) -> FloatArr
     """The step (n,) of normal equations, whatever the units of its parts; refused, by name, if they determine none."""
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information / np.outer(scale, scale)
-    if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled)[0] < 1e-10:
+    if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled)[0] < LEAST_TOLD:
         raise UndeterminedError(
             f"the returns do not determine {what}",
             remedy="Bring the target nearer, or turn it so that several scan lines cross each face.",

@@ -83,13 +83,15 @@ class PlaceFrames:
         One step from the common planes, of which a frame differs by its noise alone.
         """
         moves = np.full((self.frames, 3, 3), np.nan)
-        for j in range(3):
-            face = self.faces[j]
-            information, gradient = face.sums.information, face.sums.gradient
-            scaled = information * self.sigma_m**2 + 1e-12 * np.eye(3)
-            size = np.linalg.eigvalsh(scaled)
-            good = (face.sums.used >= FEWEST) & (size[:, 2] < 1e9 * size[:, 0])
-            moves[face.frame[good], j] = np.linalg.solve(information[good], gradient[good][..., None])[..., 0]
+        faces = [self.faces[j] for j in range(3)]
+        information, gradient, used, frame = (
+            np.concatenate(parts)
+            for parts in zip(*((f.sums.information, f.sums.gradient, f.sums.used, f.frame) for f in faces), strict=True)
+        )
+        face = np.repeat(np.arange(3), [len(f.frame) for f in faces])
+        size = np.linalg.eigvalsh(information * self.sigma_m**2 + 1e-12 * np.eye(3))
+        good = (used >= FEWEST) & (size[:, 2] < 1e9 * size[:, 0])
+        moves[frame[good], face[good]] = np.linalg.solve(information[good], gradient[good][..., None])[..., 0]
         tilted = np.stack([n + moves[:, j, 1:] @ tangents(n).T for j, n in enumerate(self.normals)], axis=1)
         corners = np.full((self.frames, 3), np.nan)
         good = np.isfinite(tilted).all(axis=(1, 2))

@@ -9,7 +9,7 @@ data do not tell of a ring shrinks to zero and stays in the covariance of the po
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -101,13 +101,18 @@ def find_rings(places: Sequence[CornerPlaceFaces]) -> Rings | None:
 
 @dataclass(frozen=True, eq=False)
 class RingEquations:
-    """Normal equations of the estimate's parameters (n) and the offsets (K): blocks of the information, gradients."""
+    """Normal equations of the estimate's parameters (n) and the offsets (K): blocks of the information, gradients.
+
+    `weighted` are the `weighted_rows` that they are of, and `jacobians` the faces', by (place, face).
+    """
 
     parameters: FloatArray
     cross: FloatArray
     rings: FloatArray
     pull: FloatArray
     ring_pull: FloatArray
+    weighted: Mapping[tuple[int, int], tuple[FloatArray, FloatArray, FloatArray]]
+    jacobians: Mapping[tuple[int, int], FloatArray]
 
     @property
     def determined(self) -> bool:
@@ -127,10 +132,11 @@ class RingEquations:
 def ring_equations(fit: CornerFit, places: Sequence[CornerPlaceFaces], rings: Rings) -> RingEquations:
     """Of a joint estimate beside offsets of all rings, at the estimate."""
     count = len(rings.elevation_rad)
-    own, ring_pull, systems, crossed = np.zeros(count), np.zeros(count), {}, {}
+    own, ring_pull, systems, crossed, seen = np.zeros(count), np.zeros(count), {}, {}, {}
     corners = fit.state.corners(fit.world)
     for (i, j), ring in rings.numbers.items():
-        residual, rows, weight = weighted_rows(places[i].faces[j], fit.state.normals[j], corners[i], fit.range_sigma_m)
+        seen[i, j] = weighted_rows(places[i].faces[j], fit.state.normals[j], corners[i], fit.range_sigma_m)
+        residual, rows, weight = seen[i, j]
         weighted = rows * weight
         systems[i, j] = FaceSystem(weighted @ rows.T, weighted @ residual)
         crossed[i, j] = np.stack([np.bincount(ring, row, count) for row in weighted])
@@ -138,9 +144,10 @@ def ring_equations(fit: CornerFit, places: Sequence[CornerPlaceFaces], rings: Ri
         ring_pull += np.bincount(ring, weight * residual, count)
     parameters, pull = joint_information(fit, systems)
     cross = np.zeros((len(pull), count))
-    for key, jacobian in face_jacobians(list(systems), fit.state, fit.world, fit.options).items():
+    jacobians = face_jacobians(list(systems), fit.state, fit.world, fit.options)
+    for key, jacobian in jacobians.items():
         cross += jacobian.T @ crossed[key]
-    return RingEquations(parameters, cross, own, pull, ring_pull)
+    return RingEquations(parameters, cross, own, pull, ring_pull, seen, jacobians)
 
 
 def _estimate_sigma(information: FloatArray, gradient: FloatArray) -> tuple[float, float]:
