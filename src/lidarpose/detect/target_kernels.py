@@ -281,6 +281,44 @@ def outside(rays: Any, normal: Any, height: float, inward: Any, least: Any) -> A
 
 
 @kernel
+def off_others(
+    beams: Any,
+    first: Any,
+    reach: Any,
+    size: int,
+    gate_m: float,
+    normals: Any,
+    heights: Any,
+    margins_m: Any,
+    obstacles: Any,
+    gaps_m: Any,
+    good: Any,
+) -> None:
+    """Which of `size` beams, rays and ranges (4, N), end where they meet their face, off the other faces' planes and
+    what borders them; without branches, for vector instructions."""
+    x, y, z, far = beams[0], beams[1], beams[2], beams[3]
+    for k in range(size):
+        good[k] = np.int64(abs(far[k] - reach[k]) < gate_m)
+    for other in range(3):
+        a, b, c, height = normals[other, 0], normals[other, 1], normals[other, 2], heights[other]
+        # Of a face's own plane nothing is asked.
+        p = margins_m[0, other] if other != 0 else -np.inf
+        q = margins_m[1, other] if other != 1 else -np.inf
+        r = margins_m[2, other] if other != 2 else -np.inf
+        for k in range(size):
+            slope = a * x[k] + b * y[k] + c * z[k]
+            least = r if first[k] == 2 else (q if first[k] == 1 else p)
+            good[k] &= np.int64(abs(slope * reach[k] - height) > least)
+    for n in range(len(obstacles)):
+        a, b, c, offset = obstacles[n, 0], obstacles[n, 1], obstacles[n, 2], obstacles[n, 3]
+        p, q, r = gaps_m[0, n], gaps_m[1, n], gaps_m[2, n]
+        for k in range(size):
+            off = a * (x[k] * reach[k]) + b * (y[k] * reach[k]) + c * (z[k] * reach[k]) - offset
+            least = r if first[k] == 2 else (q if first[k] == 1 else p)
+            good[k] &= np.int64(off > least)
+
+
+@kernel
 def beams_of_faces(
     points: Any,
     gate_m: float,
@@ -303,11 +341,12 @@ def beams_of_faces(
     Which points (M,), how many of each face (3,), their rays (3 M,), three rows for each face, their ranges (M,), and
     which (M,) lie outside the outlines.
     """
-    found = np.full(len(points), -1, np.int8)
     beams = np.empty((4, BLOCK))
-    first, reach = np.empty(BLOCK, np.int64), np.empty(BLOCK)
+    first, reach, good = np.empty(BLOCK, np.int64), np.empty(BLOCK), np.empty(BLOCK, np.int64)
     point, who = np.empty((3, 3, BLOCK)), np.empty((3, BLOCK), np.int64)
     many, total = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    of_face, which = np.empty((3, 4, len(points))), np.empty((3, len(points)), np.int64)
+    on_rim = np.empty((3, len(points)), np.bool_)
     for begin in range(0, len(points), BLOCK):
         size = min(BLOCK, len(points) - begin)
         for k in range(size):
@@ -316,47 +355,34 @@ def beams_of_faces(
             beams[0, k], beams[1, k], beams[2, k], beams[3, k] = x / far, y / far, z / far, far
         first_met(beams[0], beams[1], beams[2], normals, heights, convex, size, first, reach)
         many[:] = 0
+        off_others(beams, first, reach, size, gate_m, normals, heights, margins_m, obstacles, gaps_m, good)
         for k in range(size):
-            expected, face = reach[k], first[k]
-            if not abs(beams[3, k] - expected) < gate_m:
-                continue
-            x, y, z = beams[0, k], beams[1, k], beams[2, k]
-            px, py, pz = x * expected, y * expected, z * expected
-            good = True
-            for other in range(3):
-                slope = normals[other, 0] * x + normals[other, 1] * y + normals[other, 2] * z
-                good &= other == face or abs(slope * expected - heights[other]) > margins_m[face, other]
-            for b in range(len(obstacles)):
-                off = obstacles[b, 0] * px + obstacles[b, 1] * py + obstacles[b, 2] * pz - obstacles[b, 3]
-                good &= off > gaps_m[face, b]
-            at = many[face]
-            point[face, 0, at], point[face, 1, at], point[face, 2, at] = px, py, pz
-            who[face, at] = begin + k
-            many[face] += good
+            if good[k]:
+                face, expected = first[k], reach[k]
+                at = many[face]
+                for row in range(3):
+                    point[face, row, at] = beams[row, k] * expected
+                who[face, at] = k
+                many[face] += 1
         for face in range(3):
             inside = far_inside(point[face, :, : many[face]], inward, least, starts[face], starts[face + 1])
+            last = total[face]
             for at in range(many[face]):
-                if inside[at] > -rim_m:
-                    found[who[face, at]] = face if inside[at] > 0.0 else face + 3
-                    total[face] += 1
+                k = who[face, at]
+                for row in range(4):
+                    of_face[face, row, last] = beams[row, k]
+                which[face, last], on_rim[face, last] = begin + k, not inside[at] > 0.0
+                last += inside[at] > -rim_m
+            total[face] = last
     count = total.sum()
     index, ranges, outside_of = np.empty(count, np.int64), np.empty(count), np.empty(count, np.bool_)
-    rays = np.empty(3 * count)
-    starting = np.array([0, total[0], total[0] + total[1]])
-    at = starting.copy()
-    for i in range(len(points)):
-        if found[i] >= 0:
-            face = found[i] % 3
-            k = at[face]
-            index[k], outside_of[k] = i, found[i] >= 3
-            at[face] = k + 1
+    rays, start = np.empty(3 * count), 0
     for face in range(3):
-        begin, size = starting[face], total[face]
-        row = 3 * begin
-        for k in range(size):
-            i = index[begin + k]
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            far = np.sqrt(x * x + y * y + z * z)
-            ranges[begin + k] = far
-            rays[row + k], rays[row + size + k], rays[row + 2 * size + k] = x / far, y / far, z / far
+        size = total[face]
+        for row in range(3):
+            rays[3 * start + row * size : 3 * start + (row + 1) * size] = of_face[face, row, :size]
+        ranges[start : start + size] = of_face[face, 3, :size]
+        index[start : start + size] = which[face, :size]
+        outside_of[start : start + size] = on_rim[face, :size]
+        start += size
     return index, total, rays, ranges, outside_of

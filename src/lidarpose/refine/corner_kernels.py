@@ -288,3 +288,16 @@ def farthest_out(points: Any, directions: Any) -> Any:
             index[many + k] = i if out < least[k] else index[many + k]
             least[k] = out if out < least[k] else least[k]
     return index
+
+
+@kernel
+def gathered(rays: Any, range_m: Any, frame: Any, index: Any) -> Any:
+    """Rays (3, M), ranges (M,) and frames (M,) that `index` (M,) tells of rays (3, N), ranges and frames."""
+    count = len(index)
+    some, far, at = np.empty((3, count)), np.empty(count), np.empty(count, np.int64)
+    x, y, z = rays[0], rays[1], rays[2]
+    for k in range(count):
+        i = np.uint64(index[k])
+        some[0, k], some[1, k], some[2, k] = x[i], y[i], z[i]
+        far[k], at[k] = range_m[i], frame[i]
+    return some, far, at

@@ -105,6 +105,17 @@ class CornerFit:
         """See `place_discrepancies`."""
         return place_discrepancies(self)
 
+    @cached_property
+    def world_sigma_likelihood(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The restricted likelihood of the standard deviation of the world's coordinates.
+
+        Returns
+        -------
+        A grid (G,) of it in metres, even in the logarithm; minus twice the log likelihood (G,); and the derivatives
+        (n, 3P) of the other parameters by the coordinates' errors.
+        """
+        return _world_sigma_likelihood(self)
+
     @property
     def pose_covariance(self) -> FloatArray:
         """(6, 6) of T_world_lidar's left perturbation."""
@@ -157,9 +168,10 @@ def fit_corner_model(
     state, step, length = start, 0, np.inf
     for step in range(1, MAX_STEPS + 1):
         systems, residual = _collapsed(faces, state, world, sigma_m)
-        information, gradient = _joined(systems, state, world, options)
+        jacobians = _stacked_jacobians(list(systems), state, world, options)
+        information, gradient = _joined(systems, state, world, options, jacobians)
         delta = solved(information, gradient, _POSE) / FOLLOWED
-        moves = _stacked_jacobians(list(systems), state, world, options) @ delta
+        moves = jacobians @ delta
         state = _moved(state, delta, options)
         used_m, sigma_m = sigma_m, max(mad_sigma(residual, centred=True, near=sigma_m), MIN_SIGMA_M)
         before, length = length, float(np.sqrt(delta @ information @ delta))
@@ -285,11 +297,15 @@ def reweighted(fit: CornerFit, variance: Mapping[tuple[int, int], float]) -> Cor
 
 
 def _joined(
-    systems: Mapping[tuple[int, int], FaceSystem], state: CornerState, world: FloatArray, options: CornerOptions
+    systems: Mapping[tuple[int, int], FaceSystem],
+    state: CornerState,
+    world: FloatArray,
+    options: CornerOptions,
+    jacobians: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """The normal equations of the whole, from each face's own."""
+    """The normal equations of the whole, from each face's own, and their `_stacked_jacobians`."""
     _, errors, width = _columns(len(world), options)
-    B = _stacked_jacobians(list(systems), state, world, options)
+    B = _stacked_jacobians(list(systems), state, world, options) if jacobians is None else jacobians
     rows = B.reshape(-1, width)
     information = rows.T @ (np.array([s.information for s in systems.values()]) @ B).reshape(-1, width)
     gradient = rows.T @ np.concatenate([s.gradient for s in systems.values()])
@@ -418,7 +434,7 @@ def estimate_world_sigma(fit: CornerFit) -> tuple[float, float]:
     -------
     The standard deviation in metres (0 where nothing speaks against exact ones), and twice the gain in log likelihood.
     """
-    grid, values, _ = _world_sigma_likelihood(fit)
+    grid, values, _ = fit.world_sigma_likelihood
     best = int(np.argmin(values))
     gain = float(values[0] - values[best])
     return (float(grid[best]), gain) if gain > 0.5 else (0.0, 0.0)
@@ -441,7 +457,7 @@ def undetected_world_noise(fit: CornerFit) -> FloatArray:
     -------
     Covariance (n, n) in the order of `fit.names`.
     """
-    grid, values, followed = _world_sigma_likelihood(fit)
+    grid, values, followed = fit.world_sigma_likelihood
     # The grid is even in the logarithm of sigma: each step stands for a width that grows as sigma.
     log_weight = -0.5 * values - 2.0 * np.log1p((grid / EXPECTED_WORLD_SIGMA_M) ** 2) + np.log(grid)
     weight = np.exp(log_weight - log_weight.max())
@@ -449,13 +465,6 @@ def undetected_world_noise(fit: CornerFit) -> FloatArray:
 
 
 def _world_sigma_likelihood(fit: CornerFit) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The restricted likelihood of the standard deviation of the world's coordinates.
-
-    Returns
-    -------
-    A grid (G,) of it in metres, even in the logarithm; minus twice the log likelihood (G,); and the derivatives (n, 3P)
-    of the other parameters by the coordinates' errors.
-    """
     information, gradient, errors = without_world_noise(fit)
     # Of the errors alone, all else being free, along axes on which they are independent.
     solved = np.linalg.solve(

@@ -19,7 +19,7 @@ from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, unit
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.threads import each
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
-from lidarpose.refine.face_systems import tangents
+from lidarpose.refine.face_systems import subset_of, tangents
 
 # A side's returns are tested this far inwards, or for this share of the face where that is less.
 STRIP_M, STRIP_SHARE = 0.04, 0.2
@@ -124,7 +124,7 @@ def _kept(returns: FaceReturns, mine: BoolArray) -> FaceReturns | None:
     count = np.count_nonzero(mine)
     if count < FEWEST_RETURNS:
         return None
-    return returns if count == len(mine) else returns.subset(np.flatnonzero(mine))
+    return returns if count == len(mine) else subset_of(returns, np.flatnonzero(mine))
 
 
 def _face(

@@ -15,7 +15,7 @@ from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.robust import median
 from lidarpose.model.corner_result import FaceReturns
 from lidarpose.refine.direction_cells import DirectionGrid
-from lidarpose.refine.face_systems import SAVED_S_PER_RETURN, face_residuals, face_rows, normal_and_tangents
+from lidarpose.refine.face_systems import SAVED_S_PER_RETURN, face_residuals, face_rows, normal_and_tangents, subset_of
 
 SPOT_RAD = np.radians(1.2)
 # Beams of a multi-beam LiDAR are off by about one sigma each, all frames alike: that is no reason to drop them.
@@ -56,7 +56,7 @@ def without_foreign_spots(
     if spots is None or _is_rim_odd(seen.residual[rim] - spots.level_m, sigma_m, spots.spread_m):
         kept = np.flatnonzero(~rim)
         if len(kept) == 0:
-            return returns.subset(kept)
+            return subset_of(returns, kept)
         seen = seen.subset(kept) if len(kept) < len(rim) else seen
         spots = _spots(seen)
     odd = _odd(spots, sigma_m)
@@ -65,7 +65,7 @@ def without_foreign_spots(
             # What is something else does not end where a spot does.
             odd |= _sum_around(odd, seen.width) > 0
         kept = kept.take(np.flatnonzero(~odd.take(seen.cell)))
-    return returns if len(kept) == len(rim) else returns.subset(kept)
+    return returns if len(kept) == len(rim) else subset_of(returns, kept)
 
 
 @dataclass(frozen=True, eq=False)

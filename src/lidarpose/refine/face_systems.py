@@ -220,6 +220,16 @@ def _powers(residual: FloatArray, reach_m: float) -> tuple[float, float, float, 
     return *sums, float(v2 @ v)
 
 
+def subset_of(returns: FaceReturns, index: IntArray) -> FaceReturns:
+    """Those of a face's returns that `index` (M,), ascending, tells."""
+    if pays(0.2 * SAVED_S_PER_RETURN * len(index), "refine.corner_kernels"):
+        from lidarpose.refine.corner_kernels import gathered
+
+        rays, range_m, frame = gathered(returns.rays, returns.range_m, returns.frame, index)
+        return FaceReturns(rays.T, range_m, frame)
+    return returns.subset(index)
+
+
 def some_residuals(returns: FaceReturns, normal: FloatArray, corner: FloatArray) -> FloatArray:
     """`face_residuals` of about a thousand of the returns: enough for a first scale."""
     step = max(len(returns) // ENOUGH, 1)

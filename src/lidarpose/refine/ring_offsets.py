@@ -209,4 +209,9 @@ def some_returns(places: Sequence[CornerPlaceFaces]) -> list[CornerPlaceFaces]:
     """The places with some thousand of their returns."""
     total = sum(len(f) for p in places for f in p.faces.values())
     step = max(total // FEW_RETURNS, 1)
-    return [replace(p, faces={j: f.subset(np.arange(0, len(f), step)) for j, f in p.faces.items()}) for p in places]
+    return [replace(p, faces={j: _every(f, step) for j, f in p.faces.items()}) for p in places]
+
+
+def _every(returns: FaceReturns, step: int) -> FaceReturns:
+    rays, range_m, frame = returns.rays[:, ::step], returns.range_m[::step], returns.frame[::step]
+    return FaceReturns(np.ascontiguousarray(rays).T, np.ascontiguousarray(range_m), np.ascontiguousarray(frame))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import combinations
 
 import numpy as np
@@ -122,9 +122,15 @@ class PlaceCrop:
         count = len(self.frame)
         if count < 1.5 * most:
             return self
-        step = np.arange(most)
-        index = ((step + step * GOLDEN % 1.0) * (count / most)).astype(np.int64)
+        index = (_spread_evenly(most) * (count / most)).astype(np.int64)
         return PlaceCrop(self.points.take(index, axis=0), self.frame.take(index), self.frames)
+
+
+@lru_cache(maxsize=4)
+def _spread_evenly(most: int) -> FloatArray:
+    """One number (N,) between each of 0 to `most` and the next."""
+    step = np.arange(most)
+    return np.asarray(step + step * GOLDEN % 1.0)
 
 
 def world_coordinates(session: CornerSession) -> FloatArray:
