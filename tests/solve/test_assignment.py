@@ -176,3 +176,44 @@ def test_without_any_stripe_one_placement_is_refused(rig_maker: Callable[..., An
     dark = tuple(replace(p, stripes={}) for p in observations.places)
     with pytest.raises(UndeterminedError, match="slide along the fold"):
         assigned(replace(observations, places=dark), panels=observations.panels)
+
+
+def broken(observations: TurntableObservations, seed: int, noise: float) -> list[PlaceFeatures]:
+    """A session over a few degrees: lines broken at odd places, as steps from black to white do, and low sigmas."""
+    rng = np.random.default_rng(seed)
+    places = []
+    for p in observations.places:
+        lines: list[ScanLine] = []
+        for line in p.scan_lines.values():
+            cut = int(len(line) * rng.uniform(0.3, 0.7)) if rng.random() < 0.5 else len(line)
+            lines += [part_of(line, 0, cut), *([part_of(line, cut, len(line))] if rng.random() < 0.8 else [])]
+        stripes = {k: replace(s, sigma_px=s.sigma_px / noise) for k, s in p.stripes.items()}
+        lines = [line for line in lines if len(line) >= 6]
+        places.append(PlaceFeatures(p.position, p.turntable_angle_rad, stripes, tuple(lines), p.placement))
+    return places
+
+
+def panel_of_the_first_line(places: tuple[PlaceObservation, ...]) -> set[int]:
+    """By place, the panel of the line of smaller beam angle."""
+    return {int(p.scan_lines[0].angle_rad.mean() > p.scan_lines[1].angle_rad.mean()) for p in places}
+
+
+@pytest.mark.parametrize("noise", [1.0, 2.0, 3.0])
+def test_broken_lines_over_a_short_arc_are_assigned_rightly_or_refused_and_the_hint_helps(noise: float) -> None:
+    outcomes = []
+    for seed in range(30):
+        rig = draw_rig(seed, family=("axis-up", "right", "mixed")[seed % 3], places=5, step_deg=1.0)
+        observations = simulate_observations(rig, stripe_sigma_px=0.2 * noise, stripe_step_px=6.0, seed=seed)
+        places = broken(observations, seed, noise)
+        poses = {name: board_poses(observations.camera, c, name) for name, c in observations.corners.items()}
+        truth = panel_of_the_first_line(observations.places)
+        for hint in (None, *truth):
+            try:
+                found = assign(observations.camera, poses, places, first_panel=hint)
+            except UndeterminedError as error:
+                outcomes.append("too few places" if "needs places" in error.what else "open")
+            else:
+                outcomes.append("right")
+                assert panel_of_the_first_line(found.places) == truth
+            assert hint is None or outcomes[-1] != "open"
+    assert outcomes.count("right") > len(outcomes) / 2

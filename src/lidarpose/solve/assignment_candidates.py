@@ -140,7 +140,7 @@ def _candidates(
     ones = [fits.take(np.array([first_line[pair[0]] + pair[side] for pair in pairs])) for side in (1, 2)]
     alpha = np.array([stripes[k].alpha_rad for k, _, _ in pairs])
     extents = np.array([stripes[k].extents_m for k, _, _ in pairs])
-    kept = np.flatnonzero(_plausible(ones[0], ones[1], alpha, extents))
+    kept = np.flatnonzero(_either_way(pairs, _plausible(ones[0], ones[1], alpha, extents)))
     pairs = [pairs[c] for c in kept.tolist()]
     lines = fit_line_pairs(ones[0].take(kept), ones[1].take(kept), alpha[kept])
     samples = single_poses([stripes[k] for k, _, _ in pairs], lines)
@@ -159,6 +159,16 @@ def _candidates(
                 Candidate(k, (i, j), samples[c], lines.extents_m[c], spacing, (fit_i, fit_j), stripes[k], rays)
             )
     return found
+
+
+def _either_way(pairs: Sequence[tuple[int, int, int]], plausible: BoolArray) -> BoolArray:
+    """Pairs that are plausible themselves or exchanged.
+
+    Broken lines may cover one panel's stripe just enough and the other's just not. If that kept one order and dropped
+    the other, the one that is left would have no rival however badly it fits: lengths are weighed later, by all places.
+    """
+    good = {pair for pair, is_good in zip(pairs, plausible, strict=True) if is_good}
+    return np.array([(k, i, j) in good or (k, j, i) in good for k, i, j in pairs])
 
 
 def _has_stripe(place: PlaceFeatures, key: int) -> bool:

@@ -6,6 +6,7 @@ The rival is mostly the mirrored solution, with both lines exchanged at every pl
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -14,16 +15,12 @@ from lidarpose.errors import InputError, UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray, angle_between, unit
 from lidarpose.geometry.se3 import Pose, exp_se3, log_se3
 from lidarpose.model.observation import PlaceFeatures
-from lidarpose.solve.assignment_candidates import Candidate, Pool
+from lidarpose.solve.assignment_candidates import FOLD_SLACK_M, Candidate, Pool
 from lidarpose.solve.assignment_solutions import Solution, is_same, rms_misfit, support_of
 from lidarpose.solve.line_pair import FittedLines, fit_line_pairs
 from lidarpose.solve.panel_pose import PanelPose
 from lidarpose.solve.single_pose import rotations_and_centres
 
-# One solution beats another where its residuals are this much smaller at least, and that is no chance: the logarithm of
-# the ratio of two equal deviations with n degrees of freedom scatters by sqrt(1/n) (more for small n).
-LEAST_RATIO = 2.0
-LEAST_DEVIATIONS = 5.0
 # What a panel's pose may be wrong by beyond twice its stated deviation, because neither boards nor lenses are perfect,
 # before one solution is held for better than another.
 PANEL_TURN_RAD = 3e-4
@@ -34,9 +31,34 @@ FAR_OFF_RAD = 0.005
 LOOKED_AT = 10
 # It beats it too where the lines' ends agree so much better with the stripes' ends (difference of chi-squared).
 LEAST_ENDS_GAIN = 30.0
+# A piece that detection has broken off a line, at a step from black squares to white ones, lies so near to it.
+PIECE_OFF_M = 0.006
+PIECE_GAP_M = 0.05
+# A rival with candidates at fewer of the places that the best explains cannot be compared with it.
+LEAST_SHARED = 0.5
 # How unequally the ends of stripes may be cut off on both panels, by detection or by margins.
 ENDS_BIAS_M = 0.015
 HINT = "--first-panel"
+BY_HINT = f"the order given by {HINT}"
+
+
+@dataclass(frozen=True)
+class _Margin:
+    """When one solution beats another: its residuals are smaller by a ratio at least, and that is no chance.
+
+    The logarithm of the ratio of two equal deviations with n degrees of freedom scatters by sqrt(1/n) (more for small
+    n): `deviations` times that. Residuals below the floor (of a stated sigma) count as the floor.
+    """
+
+    ratio: float
+    deviations: float
+    floor: float
+
+
+# Residuals far below the stated sigma are rounding, not evidence.
+BETTER = _Margin(ratio=2.0, deviations=5.0, floor=0.02)
+# What the user states outweighs evidence that is not far beyond what would decide without his word.
+AGAINST_STATED = _Margin(ratio=5.0, deviations=7.5, floor=1.0)
 
 
 def decide(
@@ -51,21 +73,23 @@ def decide(
     solutions = [best, *(s for s in solutions[1:] if not is_same(best, s))]
     figures = {"solutions": float(len(solutions)), "rms_sigmas": rms_misfit(best.misfit, support_of(best))}
     look = partial(_rms_with_panels, pool, places, panel_poses)
-    rivals = [s for s in solutions[1:] if not _beaten_by_motion(pool, best, s, look)]
+    rivals = [s for s in solutions[1:] if not _beaten_by_motion(pool, best, s, look, BETTER)]
     if len(solutions) > 1:
         figures["rival_rms_sigmas"] = min(rms_misfit(s.misfit, support_of(best)) for s in solutions[1:])
     decided_by = "the motion of all places" if len(solutions) > 1 else "no rival"
     if rivals:
-        gains = [_ends_gain(pool, best, s) for s in rivals]
+        gains = [_ends_gain(pool, places, best, s) for s in rivals]
         figures["ends_gain"] = min(gains)
         if min(gains) < -LEAST_ENDS_GAIN:  # a rival's ends agree better, and its motion is no worse
             best, rivals = rivals[int(np.argmin(gains))], [best, *rivals]
             rivals = [s for s in rivals if s is not best]
-            gains = [_ends_gain(pool, best, s) for s in rivals]
+            gains = [_ends_gain(pool, places, best, s) for s in rivals]
         rivals = [s for s, gain in zip(rivals, gains, strict=True) if gain < LEAST_ENDS_GAIN]
         decided_by = "the ends of the lines"
     if first_panel is not None:
-        return _by_hint(pool, best, rivals, places, first_panel, decided_by), _told(rivals, decided_by), figures
+        beaten = [s for s in solutions if s is not best and s not in rivals]
+        stated = _by_hint(pool, [best, *rivals, *beaten], places, first_panel, look, decided_by)
+        return stated, _told(stated in beaten, bool(rivals), decided_by), figures
     if rivals:
         raise UndeterminedError(
             "Nothing in the data tells which scan line lies on which panel: two mirrored solutions fit equally well",
@@ -75,26 +99,34 @@ def decide(
     return best, decided_by, figures
 
 
-def _told(rivals: list[Solution], decided_by: str) -> str:
-    return f"the order given by {HINT}" if rivals else decided_by
+def _told(against: bool, open_without: bool, decided_by: str) -> str:
+    if against:
+        return f"{BY_HINT}, against {decided_by}"
+    return BY_HINT if open_without else decided_by
 
 
 def _by_hint(
     pool: Pool,
-    best: Solution,
-    rivals: list[Solution],
+    solutions: Sequence[Solution],
     places: Sequence[PlaceFeatures],
     first_panel: int,
+    look: Callable[[Solution, IntArray], float],
     decided_by: str,
 ) -> Solution:
-    agreeing = [s for s in (best, *rivals) if _share_with_hint(pool, s, places, first_panel) > 0.5]
-    if not agreeing:
-        raise InputError(
-            HINT,
-            f"{decided_by} contradict it: the line of smaller beam angle does not lie on panel {first_panel + 1}",
-            remedy="Leave the option out, or check that the panels are in the session's order",
-        )
-    return agreeing[0]
+    """The first of the solutions, the best before its rivals and these before what is beaten, that has the order told.
+
+    The user stands beside the rig: he is contradicted by a motion that fits far worse, and never by the lines' ends.
+    """
+    best = solutions[0]
+    for s in solutions:
+        agrees = _share_with_hint(pool, s, places, first_panel) > 0.5
+        if agrees and (s is best or not _beaten_by_motion(pool, best, s, look, AGAINST_STATED)):
+            return s
+    raise InputError(
+        HINT,
+        f"contradicted by {decided_by}: the line of smaller beam angle does not lie on panel {first_panel + 1}",
+        remedy="Leave the option out, or check that the panels are in the session's order",
+    )
 
 
 def _share_with_hint(pool: Pool, solution: Solution, places: Sequence[PlaceFeatures], first_panel: int) -> float:
@@ -107,30 +139,42 @@ def _share_with_hint(pool: Pool, solution: Solution, places: Sequence[PlaceFeatu
     return float(np.mean(votes)) if votes else 0.0
 
 
-def _beaten_by_motion(pool: Pool, best: Solution, rival: Solution, look: Callable[[Solution, IntArray], float]) -> bool:
-    """Whether the rival's places fit one motion so much worse that neither chance nor the panels' poses explain it."""
+def _beaten_by_motion(
+    pool: Pool,
+    best: Solution,
+    rival: Solution,
+    look: Callable[[Solution, IntArray], float],
+    needed: _Margin,
+) -> bool:
+    """Whether the rival's places fit one motion so much worse that neither chance nor the panels' poses explain it.
+
+    Both are judged by the places that both explain or might: a candidate that a rival lacks, because detection broke a
+    line, is no evidence against it.
+    """
     support = support_of(best)
-    ours, theirs = rms_misfit(best.misfit, support), rms_misfit(rival.misfit, support)
-    if not np.isfinite(theirs):
-        return True
-    smallest = np.median([np.linalg.eigvalsh(c.sample.rotation_covariance())[0] for c in pool.candidates])
     both = np.flatnonzero(support & (rival.chosen >= 0))
-    if len(both) < 3 or theirs * np.sqrt(smallest) < FAR_OFF_RAD:
-        both = both[np.unique(np.linspace(0, len(both) - 1, LOOKED_AT).astype(int))]
-        theirs = look(rival, both)
-        # A closer look only ever lowers the misfit: if the rival is beaten without one at the best, it is with one.
-        ours = float(np.sqrt(np.mean(best.misfit[both] ** 2)))
-        return _is_smaller(ours, theirs, len(both)) or _is_smaller(look(best, both), theirs, len(both))
-    return _is_smaller(ours, theirs, int(support.sum()))
+    if len(both) < max(3, LEAST_SHARED * support.sum()):
+        return True
+    ours, theirs = (float(np.sqrt(np.mean(s.misfit[both] ** 2))) for s in (best, rival))
+    smallest = np.median([np.linalg.eigvalsh(c.sample.rotation_covariance())[0] for c in pool.candidates])
+    if theirs * np.sqrt(smallest) >= FAR_OFF_RAD:
+        return _is_smaller(ours, theirs, len(both), needed)
+    both = both[np.unique(np.linspace(0, len(both) - 1, LOOKED_AT).astype(int))]
+    theirs = look(rival, both)
+    # A closer look only ever lowers the misfit: if the rival is beaten without one at the best, it is with one.
+    ours = float(np.sqrt(np.mean(best.misfit[both] ** 2)))
+    return _is_smaller(ours, theirs, len(both), needed) or _is_smaller(look(best, both), theirs, len(both), needed)
 
 
-def _is_smaller(ours: float, theirs: float, places: int) -> bool:
-    """Whether one root mean square misfit is smaller than another by more than chance explains."""
-    # Residuals far below the stated sigma are rounding, not evidence.
-    ratio = theirs / max(ours, 0.02)
+def _is_smaller(ours: float, theirs: float, places: int, needed: _Margin) -> bool:
+    """Whether one root mean square misfit is smaller than another by more than chance explains.
+
+    An F test of sorts: the ratio is free of the unknown factor by which all noise is larger than stated.
+    """
+    ratio = theirs / max(ours, needed.floor)
     freedom = max(6 * places - 10, 1)
-    needed = LEAST_DEVIATIONS / np.sqrt(freedom) * (1.0 + 5.0 / freedom)
-    return bool(ratio > LEAST_RATIO and np.log(ratio) > needed)
+    by_chance = needed.deviations / np.sqrt(freedom) * (1.0 + 5.0 / freedom)
+    return bool(ratio > needed.ratio and np.log(ratio) > by_chance)
 
 
 def _rms_with_panels(
@@ -231,31 +275,56 @@ def _samples_on(
     return R.reshape(C, K, 3, 3), t.reshape(C, K, 3)
 
 
-def _ends_gain(pool: Pool, best: Solution, rival: Solution) -> float:
+def _ends_gain(pool: Pool, places: Sequence[PlaceFeatures], best: Solution, rival: Solution) -> float:
     """By how much chi-squared of the lines' ends, against the stripes' ends, is smaller for the best than the rival.
 
     Only the difference between both panels counts: detection may well cut off stripes and lines, but alike on both. An
-    unknown inequality of that is allowed for, the same at all places.
+    unknown inequality of that is allowed for, the same at all places. What one place alone says does not count: the
+    gain is what is left without the place that says most.
     """
     both = np.flatnonzero((best.chosen >= 0) & (rival.chosen >= 0))
-    if len(both) == 0:
+    if len(both) < 2:
         return 0.0
-    chi2 = []
+    differences = []
     spacing = float(np.median([pool.candidates[best.chosen[p]].spacing_m for p in both]))
     for solution in (best, rival):
         chosen = [pool.candidates[solution.chosen[p]] for p in both]
-        off = np.stack([c.extents_m - c.stripes.extents_m for c in chosen])
-        chi2.append(off[:, 0] - off[:, 1])
+        off = np.stack([_ends_with_pieces(places[c.place], c) - c.stripes.extents_m for c in chosen])
+        differences.append(off[:, 0] - off[:, 1])
     # Scatter from place to place, of the better one, never below two beams.
-    scatter = [float(np.median(np.abs(d - np.median(d, axis=0)))) * 1.4826 for d in chi2]
+    scatter = [float(np.median(np.abs(d - np.median(d, axis=0)))) * 1.4826 for d in differences]
     sigma = max(min(scatter), 2.0 * spacing, 0.003)
-    values = [_chi2_with_bias(d[:, 0], sigma) + _chi2_with_bias(d[:, 1], sigma) for d in chi2]
-    return values[1] - values[0]
+    ours, theirs = (_chi2_without_each(d, sigma) for d in differences)
+    gains = theirs - ours
+    return float(max(gains.min(), 0.0) + min(gains.max(), 0.0))
 
 
-def _chi2_with_bias(differences: FloatArray, sigma: float) -> float:
-    """Chi-squared of values (N,) with noise `sigma` and one common unknown bias; outlying values are bounded."""
+def _chi2_without_each(differences: FloatArray, sigma: float) -> FloatArray:
+    """Chi-squared (1 + N,) of values (N, 2), all and without each place in turn.
+
+    Noise `sigma` and one common unknown bias a column; outlying values are bounded.
+    """
     d = np.clip(differences, -0.2, 0.2)
-    total, n = float(d.sum()), len(d)
+    left_out = np.vstack([np.zeros((1, d.shape[1])), d])
+    n = np.array([len(d), *[len(d) - 1] * len(d)])[:, None]
+    total, squares = d.sum(axis=0) - left_out, (d**2).sum(axis=0) - left_out**2
     common = ENDS_BIAS_M**2 / (sigma**2 + n * ENDS_BIAS_M**2)
-    return (float(d @ d) - common * total**2) / sigma**2
+    return np.asarray(((squares - common * total**2) / sigma**2).sum(axis=1))
+
+
+def _ends_with_pieces(place: PlaceFeatures, candidate: Candidate) -> FloatArray:
+    """Where both scan lines end along their panels (2, 2), with the pieces that detection has broken off them."""
+    extents = np.array(candidate.extents_m)
+    E = candidate.fits[0].line.intersection(candidate.fits[1].line)
+    others = [line.points_lidar() for j, line in enumerate(place.lines) if j not in candidate.lines]
+    for key, fit in enumerate(candidate.fits):
+        outward = unit(fit.middle - E)
+        low, high = np.sort((fit.ends - E) @ outward)
+        for points in others:
+            off = np.abs(points @ fit.line.normal - fit.line.offset)
+            near, far = np.sort((points[[0, -1]] - E) @ outward)
+            beside = max(near - high, low - far) < PIECE_GAP_M and near > -FOLD_SLACK_M
+            if beside and off.max() < PIECE_OFF_M + 3.0 * fit.direction_sigma_rad * max(far - low, high - near):
+                extents[key] += [min(near - low, 0.0), max(far - high, 0.0)]
+                low, high = min(low, near), max(high, far)
+    return extents
