@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,9 @@ from lidarpose.measure.point_sigma import shifting_parameters
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.turntable import TurntableMotion
+
+# Of every parameter of a calibration: small against their standard deviations, large against rounding.
+_STEP = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +96,20 @@ def chosen_beams(
     stated = own.range_scale * np.where((r > 0.0) & (r < np.inf), r, np.nan)
     r = (stated - further.get("range_offset_m", 0.0)) / (own.range_scale + further.get("range_scale", 0.0))
     return Beams(origin, direction, r)
+
+
+MovedBeams = Callable[[FloatArray, IntArray], Beams]
+"""The beams of flat indices under a small change (p,) of the calibration's parameters."""
+
+
+def calibration_sigmas(sizes: Callable[[FloatArray], FloatArray], covariance: FloatArray) -> FloatArray:
+    """Standard deviations (m,) of sizes by a calibration's covariance (p, p), by central differences.
+
+    `sizes` gives them (m,) under a small change (p,) of the calibration's parameters.
+    """
+    steps = _STEP * np.eye(len(covariance))
+    gradient = np.stack([(sizes(step) - sizes(-step)) / (2.0 * _STEP) for step in steps])
+    return np.asarray(np.sqrt(np.maximum(np.einsum("ke,kl,le->e", gradient, covariance, gradient), 0.0)))
 
 
 def range_noise(range_m: FloatArray) -> float:

@@ -7,7 +7,6 @@ the box stands on or leans against.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -17,7 +16,7 @@ from scipy import ndimage
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, unit
 from lidarpose.geometry.planes import Plane
-from lidarpose.measure.beams import Beams, fit_plane_to_ranges, plane_ranges
+from lidarpose.measure.beams import Beams, MovedBeams, calibration_sigmas, fit_plane_to_ranges, plane_ranges
 from lidarpose.measure.edge_beams import WIDEST_SPOT_M, PlaneView, edge_beams, view_of_patch
 from lidarpose.measure.edge_model import fit_straight_edge
 from lidarpose.measure.outline import in_plane
@@ -310,9 +309,6 @@ def _plane_variance(face: _Face, point: FloatArray) -> float:
     return float(J @ face.view.plane_covariance @ J)
 
 
-MovedBeams = Callable[[FloatArray, IntArray], Beams]
-
-
 def with_calibration(box: BoxMeasurement, moved: MovedBeams, covariance: FloatArray) -> BoxMeasurement:
     """The measurement with the calibration's share of each length's standard deviation.
 
@@ -323,13 +319,7 @@ def with_calibration(box: BoxMeasurement, moved: MovedBeams, covariance: FloatAr
     covariance : (n, n)
         Of these parameters.
     """
-    gradients = np.zeros((len(box.edges), len(covariance)))
-    for k in range(len(covariance)):
-        step = np.zeros(len(covariance))
-        step[k] = 1e-5
-        ends = [edge_lengths(box, moved, sign * step) for sign in (1.0, -1.0)]
-        gradients[:, k] = (ends[0] - ends[1]) / 2e-5
-    shares = np.sqrt(np.maximum(np.einsum("ek,kl,el->e", gradients, covariance, gradients), 0.0))
+    shares = calibration_sigmas(lambda change: edge_lengths(box, moved, change), covariance)
     edges = tuple(replace(e, calibration_sigma_m=float(s)) for e, s in zip(box.edges, shares, strict=True))
     return replace(box, edges=edges)
 

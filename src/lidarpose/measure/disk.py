@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +10,15 @@ from scipy import ndimage
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.circles import Circle2
 from lidarpose.geometry.planes import Plane
-from lidarpose.measure.beams import Beams, fit_plane_to_ranges, moved_plane, plane_frame, plane_ranges
+from lidarpose.measure.beams import (
+    Beams,
+    MovedBeams,
+    calibration_sigmas,
+    fit_plane_to_ranges,
+    moved_plane,
+    plane_frame,
+    plane_ranges,
+)
 from lidarpose.measure.edge_beams import WIDEST_SPOT_M, PlaneView, box_of, edge_beams, places_on, view_of_patch
 from lidarpose.measure.edge_model import EdgeBeams, EdgeFit, fit_edge, tells_threshold
 from lidarpose.measure.outline import (
@@ -278,30 +285,21 @@ def circle_on_plane(edge: Beams, plane: Plane, support: EdgeSupport) -> float:
     return radius
 
 
-def with_calibration(
-    measurement: RoundMeasurement,
-    perturbed_beams: Callable[[FloatArray, IntArray], Beams],
-    covariance: FloatArray,
-) -> RoundMeasurement:
+def with_calibration(measurement: RoundMeasurement, moved: MovedBeams, covariance: FloatArray) -> RoundMeasurement:
     """The measurement with the calibration's share of the diameter's standard deviation.
 
     Parameters
     ----------
-    perturbed_beams
+    moved
         Gives the beams of flat indices under a small change (n,) of the calibration's parameters.
     covariance : (n, n)
         Of these parameters.
     """
     support = measurement.support
     plane_index = support.plane_index[:: max(1, len(support.plane_index) // 1500)]
-    gradient = np.zeros(len(covariance))
-    for k in range(len(covariance)):
-        step = np.zeros(len(covariance))
-        step[k] = 1e-5
-        radii = []
-        for sign in (1.0, -1.0):
-            plane = fit_plane_to_ranges(support.plane, perturbed_beams(sign * step, plane_index), np.inf)[0]
-            radii.append(circle_on_plane(perturbed_beams(sign * step, support.edge_index), plane, support))
-        gradient[k] = (radii[0] - radii[1]) / 2e-5
-    share = 2.0 * float(np.sqrt(max(float(gradient @ covariance @ gradient), 0.0)))
-    return replace(measurement, calibration_sigma_m=share)
+
+    def diameter(change: FloatArray) -> FloatArray:
+        plane = fit_plane_to_ranges(support.plane, moved(change, plane_index), np.inf)[0]
+        return np.array([2.0 * circle_on_plane(moved(change, support.edge_index), plane, support)])
+
+    return replace(measurement, calibration_sigma_m=float(calibration_sigmas(diameter, covariance)[0]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.measure.assemble import readings_between
-from lidarpose.measure.beams import Beams, beams_of, chosen_beams, range_noise
+from lidarpose.measure.beams import Beams, MovedBeams, beams_of, chosen_beams, range_noise
 from lidarpose.measure.box import BoxMeasurement
 from lidarpose.measure.box import measure_box as measure_box_of
 from lidarpose.measure.box import with_calibration as box_with_calibration
@@ -54,7 +54,7 @@ class MeasuringView:
     frame: str
     sees_behind: bool = True
     covariance: FloatArray | None = None
-    moved: Callable[[FloatArray, IntArray], Beams] | None = None
+    moved: MovedBeams | None = None
     shifts: PointShifts | None = None
     remarks: tuple[str, ...] = ()
 
