@@ -24,6 +24,7 @@ from lidarpose.model.sense import StatedSense
 from lidarpose.model.session import TurntablePlace, TurntableSession
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.model.turntable_run import Deviation, FunctionDeviation, Method, TruthError, TurntableRun
+from lidarpose.workflows.early_images import EarlyImages
 from lidarpose.workflows.forked import NotAloneError, copies_likely, share
 from lidarpose.workflows.named_causes import with_cause_named
 from lidarpose.workflows.reversed_scans import Solved, doubt_reversed, reversed_part, reversed_scans
@@ -318,7 +319,7 @@ def _detect_with_copies(
     meanwhile: Meanwhile,
     stack: ExitStack,
 ) -> _Detected:
-    """The same with the help of forked copies: scans while the boards are found, then images.
+    """The same with the help of forked copies: scans and the first images while the boards are found, then images.
 
     OpenCV is imported once the first copies, which do not need it, have begun; until `stack` ends it has no threads.
     """
@@ -332,12 +333,20 @@ def _detect_with_copies(
 
     # One scan at a time: nobody waits long for another one's last.
     places = list(chain(*batches))
-    lines = share(lambda k: _find_scan_lines(session, places[k]), len(places), copies=copies, first=find_boards)
+    images = [place.stripe_image for place in places if place.stripe_image is not None]
+    early = EarlyImages(images, (session.camera.height, session.camera.width))
+
+    def prepare(k: int) -> tuple[ScanLine, ...] | LeftOut | bool:
+        return _find_scan_lines(session, places[k]) if k < len(places) else early.decode(k - len(places))
+
+    prepared = share(prepare, len(places) + len(early), copies=copies, first=find_boards)
+    lines = [each for each in prepared if not isinstance(each, bool)]
+    early.keep([each for each in prepared if isinstance(each, bool)])
     boards, finders = found[0]
 
     def search(k: int) -> list[_Stripes]:
         # One image after the other, as each is asked for.
-        images = (place.stripe_image.load() for place in batches[k] if place.stripe_image is not None)
+        images = (early.load(place.stripe_image) for place in batches[k] if place.stripe_image is not None)
         return _find_stripes(finders[batches[k][0].placement], batches[k], images)
 
     stripes = share(
