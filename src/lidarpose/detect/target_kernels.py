@@ -319,6 +319,23 @@ def off_others(
 
 
 @kernel
+def one_after_other(of_face: Any, which: Any, on_rim: Any, total: Any) -> Any:
+    """What has been found face by face, the first `total` (3,) of each, as `beams_of_faces` has it."""
+    count = total.sum()
+    index, ranges, outside_of = np.empty(count, np.int64), np.empty(count), np.empty(count, np.bool_)
+    rays, start = np.empty(3 * count), 0
+    for face in range(3):
+        size = total[face]
+        for row in range(3):
+            rays[3 * start + row * size : 3 * start + (row + 1) * size] = of_face[face, row, :size]
+        ranges[start : start + size] = of_face[face, 3, :size]
+        index[start : start + size] = which[face, :size]
+        outside_of[start : start + size] = on_rim[face, :size]
+        start += size
+    return index, rays, ranges, outside_of
+
+
+@kernel
 def beams_of_faces(
     points: Any,
     gate_m: float,
@@ -374,15 +391,5 @@ def beams_of_faces(
                 which[face, last], on_rim[face, last] = begin + k, not inside[at] > 0.0
                 last += inside[at] > -rim_m
             total[face] = last
-    count = total.sum()
-    index, ranges, outside_of = np.empty(count, np.int64), np.empty(count), np.empty(count, np.bool_)
-    rays, start = np.empty(3 * count), 0
-    for face in range(3):
-        size = total[face]
-        for row in range(3):
-            rays[3 * start + row * size : 3 * start + (row + 1) * size] = of_face[face, row, :size]
-        ranges[start : start + size] = of_face[face, 3, :size]
-        index[start : start + size] = which[face, :size]
-        outside_of[start : start + size] = on_rim[face, :size]
-        start += size
+    index, rays, ranges, outside_of = one_after_other(of_face, which, on_rim, total)
     return index, total, rays, ranges, outside_of

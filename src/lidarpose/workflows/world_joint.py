@@ -16,7 +16,7 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.robust import box_plot_inliers, mad_sigma
 from lidarpose.geometry.threads import each
-from lidarpose.model.calibration import WorldCalibration
+from lidarpose.model.calibration import Quality, WorldCalibration
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import CornerSession
 from lidarpose.model.observation import LeftOut
@@ -225,10 +225,8 @@ def _judged(
     share = turntable_share(session, fit, used)
     wrong = wrong_coordinate(fit)
     further = [part.covariance for part in (share, wrong, beside.possible) if part is not None]
-    if session.world_sigma_m is None and fit.world_sigma_m > 0.0:
-        further.append(unsure_noise(fit))
-    elif session.world_sigma_m is None:
-        further.append(undetected_world_noise(fit))
+    if session.world_sigma_m is None:
+        further.append(unsure_noise(fit) if fit.world_sigma_m > 0.0 else undetected_world_noise(fit))
     further_covariance = np.asarray(sum(further)) if further else None
     evidence = CornerEvidence(
         tuple(p.position for p in used),
@@ -252,7 +250,11 @@ def _judged(
     covariance = fit.covariance * float(quality.figures["covariance_factor"])
     if further_covariance is not None:
         covariance = covariance + further_covariance
-    calibration = WorldCalibration(
+    return joint_run(session, _calibration(session, fit, covariance, quality), fit, used, selected.by_frame)
+
+
+def _calibration(session: CornerSession, fit: CornerFit, covariance: FloatArray, quality: Quality) -> WorldCalibration:
+    return WorldCalibration(
         fit.state.T_world_lidar,
         session.cloud_frame,
         fit.state.scale,
@@ -262,7 +264,6 @@ def _judged(
         quality,
         provenance(session, "joint"),
     )
-    return joint_run(session, calibration, fit, used, selected.by_frame)
 
 
 def _usable_world(session: CornerSession, found: FoundTarget) -> CornerSession:
