@@ -88,6 +88,27 @@ def _rebuild_undetermined_error(what: str, remedy: str, details: tuple[str, ...]
     return UndeterminedError(what, remedy=remedy, details=details)
 
 
+class AmbiguousError(UndeterminedError):
+    """Two solutions explain the data, and nothing tells which is right (exit status 1).
+
+    Parameters
+    ----------
+    misfit_sigmas
+        Root mean square residual of the better one in stated sigmas: if that is small, nothing is wrong with the data.
+    """
+
+    def __init__(self, what: str, *, remedy: str, misfit_sigmas: float) -> None:
+        super().__init__(what, remedy=remedy)
+        self.misfit_sigmas = misfit_sigmas
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuild_ambiguous_error, (self.what, self.remedy, self.misfit_sigmas)
+
+
+def _rebuild_ambiguous_error(what: str, remedy: str, misfit_sigmas: float) -> AmbiguousError:
+    return AmbiguousError(what, remedy=remedy, misfit_sigmas=misfit_sigmas)
+
+
 class RejectedError(UndeterminedError):
     """An estimate was made, and its own tests say that it must not be used (exit status 1).
 

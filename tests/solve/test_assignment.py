@@ -216,4 +216,10 @@ def test_broken_lines_over_a_short_arc_are_assigned_rightly_or_refused_and_the_h
                 outcomes.append("right")
                 assert panel_of_the_first_line(found.places) == truth
             assert hint is None or outcomes[-1] != "open"
+        try:
+            other = assign(observations.camera, poses, places, first_panel=1 - min(truth))
+        except (InputError, UndeterminedError):
+            continue
+        # What the user states against evidence that would have decided is taken, and doubted.
+        assert other.against is not None or "open" in outcomes[-2:]
     assert outcomes.count("right") > len(outcomes) / 2

@@ -32,8 +32,8 @@ from lidarpose.solve.assignment_candidates import (
     candidates_of,
     pool_of,
 )
-from lidarpose.solve.assignment_decision import decide
-from lidarpose.solve.assignment_solutions import Solution, solutions_of, support_of
+from lidarpose.solve.assignment_decision import Decision, decide
+from lidarpose.solve.assignment_solutions import SLACK_SIGMAS, Solution, rms_misfit, solutions_of, support_of
 from lidarpose.solve.light_plane import StripePair
 from lidarpose.solve.line_pair import FittedLines
 from lidarpose.solve.panel_pose import PanelPose
@@ -61,6 +61,8 @@ class Assignment:
         The evidence as numbers, units in the keys.
     stripe_pairs
         The light plane and stripes of each place by position, where all points of the stripes were used.
+    against
+        What speaks for the other order, where the user's was taken.
     """
 
     places: tuple[PlaceObservation, ...]
@@ -69,6 +71,7 @@ class Assignment:
     decided_by: str
     figures: Mapping[str, float]
     stripe_pairs: Mapping[str, StripePair] = field(default_factory=dict)
+    against: str | None = None
 
 
 def assign(
@@ -110,15 +113,22 @@ def assign(
     _require_places(angles[usable], places, reasons)
     pool = pool_of(candidates, angles)
     solutions = solutions_of(pool)
-    if not solutions:
+    if not solutions or _explain_nothing(solutions[0], places):
         raise UndeterminedError(
             "No turning motion explains the places: no choice of scan lines fits the stripes and the readings",
             remedy="Check that the readings in positions.csv are in degrees and belong to their scans and images, "
             "and that the board did not move",
             details=_details(places, reasons),
         )
-    best, decided_by, figures = decide(pool, solutions, places, panel_poses, first_panel)
-    return _assignment(pool, best, places, reasons, decided_by, figures)
+    decision = decide(pool, solutions, places, panel_poses, first_panel)
+    return _assignment(pool, decision, places, reasons)
+
+
+def _explain_nothing(best: Solution, places: Sequence[PlaceFeatures]) -> bool:
+    """Whether even the best motion leaves most lit places aside and fits the others no better than chance lines."""
+    support = support_of(best)
+    lit = sum(len(place.stripes) > 1 for place in places)
+    return bool(support.sum() < 0.5 * lit and rms_misfit(best.misfit, support) > SLACK_SIGMAS)
 
 
 def _without_stripes(
@@ -151,12 +161,11 @@ def _details(places: Sequence[PlaceFeatures], reasons: Mapping[int, str]) -> tup
 
 def _assignment(
     pool: Pool,
-    best: Solution,
+    decision: Decision,
     places: Sequence[PlaceFeatures],
     reasons: dict[int, str],
-    decided_by: str,
-    figures: dict[str, float],
 ) -> Assignment:
+    best = decision.solution
     support = support_of(best)
     chosen = {int(k): pool.candidates[best.chosen[k]] for k in np.flatnonzero(support)}
     pieces = _pieces(places, chosen)
@@ -176,7 +185,15 @@ def _assignment(
     angles = np.array([p.turntable_angle_rad for p in assigned])
     _require_places(angles, places, reasons)
     left_out = tuple(LeftOut(f"position {places[k].position}", reason) for k, reason in sorted(reasons.items()))
-    return Assignment(tuple(assigned), left_out, best.motion, decided_by, figures, stripe_pairs)
+    return Assignment(
+        tuple(assigned),
+        left_out,
+        best.motion,
+        decision.decided_by,
+        decision.figures,
+        stripe_pairs,
+        decision.against,
+    )
 
 
 def _pieces(places: Sequence[PlaceFeatures], chosen: Mapping[int, Candidate]) -> dict[tuple[int, int], list[ScanLine]]:

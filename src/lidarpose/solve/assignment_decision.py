@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from lidarpose.errors import InputError, UndeterminedError
+from lidarpose.errors import AmbiguousError, InputError
 from lidarpose.geometry.arrays import FloatArray, IntArray, angle_between, unit
 from lidarpose.geometry.se3 import Pose, exp_se3, log_se3
 from lidarpose.model.observation import PlaceFeatures
@@ -42,6 +42,16 @@ HINT = "--first-panel"
 BY_HINT = f"the order given by {HINT}"
 
 
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """The solution taken, what decided, the evidence, and what speaks against it where the user's word decided."""
+
+    solution: Solution
+    decided_by: str
+    figures: dict[str, float]
+    against: str | None = None
+
+
 @dataclass(frozen=True)
 class _Margin:
     """When one solution beats another: its residuals are smaller by a ratio at least, and that is no chance.
@@ -67,8 +77,8 @@ def decide(
     places: Sequence[PlaceFeatures],
     panel_poses: Mapping[str, Sequence[PanelPose]],
     first_panel: int | None,
-) -> tuple[Solution, str, dict[str, float]]:
-    """The solution that the evidence is for, what decided, and the figures. Raises where nothing decides."""
+) -> Decision:
+    """The solution that the evidence is for, or the user's word. Raises where nothing decides."""
     best = solutions[0]
     solutions = [best, *(s for s in solutions[1:] if not is_same(best, s))]
     figures = {"solutions": float(len(solutions)), "rms_sigmas": rms_misfit(best.misfit, support_of(best))}
@@ -89,20 +99,25 @@ def decide(
     if first_panel is not None:
         beaten = [s for s in solutions if s is not best and s not in rivals]
         stated = _by_hint(pool, [best, *rivals, *beaten], places, first_panel, look, decided_by)
-        return stated, _told(stated in beaten, bool(rivals), decided_by), figures
+        figures["rms_sigmas"] = rms_misfit(stated.misfit, support_of(stated))
+        told = BY_HINT if rivals or stated in beaten else decided_by
+        return Decision(stated, told, figures, _against(stated, solutions[0], stated in beaten, decided_by))
     if rivals:
-        raise UndeterminedError(
+        raise AmbiguousError(
             "Nothing in the data tells which scan line lies on which panel: two mirrored solutions fit equally well",
             remedy=f"Say it with {HINT} 1 or {HINT} 2 (the panel that the scan line of smaller beam angle lies on), "
             "or tilt the board or shift one panel's end so that the two are no mirror images, and record again",
+            misfit_sigmas=figures["rms_sigmas"],
         )
-    return best, decided_by, figures
+    return Decision(best, decided_by, figures)
 
 
-def _told(against: bool, open_without: bool, decided_by: str) -> str:
-    if against:
-        return f"{BY_HINT}, against {decided_by}"
-    return BY_HINT if open_without else decided_by
+def _against(stated: Solution, best: Solution, is_beaten: bool, decided_by: str) -> str | None:
+    """What speaks for another order than the one stated: evidence that would do, or residuals that are smaller."""
+    if is_beaten:
+        return decided_by
+    ours, theirs = (rms_misfit(s.misfit, support_of(s)) for s in (best, stated))
+    return "residuals less than half as large" if theirs > BETTER.ratio * max(ours, AGAINST_STATED.floor) else None
 
 
 def _by_hint(

@@ -13,16 +13,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidarpose.errors import UndeterminedError
-from lidarpose.model.observation import LeftOut, PlaceFeatures, TurntableObservations
+from lidarpose.errors import AmbiguousError, UndeterminedError
+from lidarpose.model.observation import LeftOut, PlaceFeatures
 from lidarpose.model.session import TurntableSession
 from lidarpose.workflows.reversed_scans import Solved, describe_reversed, reversed_part
 
 Places = Sequence[PlaceFeatures]
+# How many of the places given find their scan lines, and their root mean square misfit in sigmas.
+Tried = tuple[int, float]
 
 _STILL_PX = 1.0
 _TURNED_RAD = np.deg2rad(0.5)
 _MOST_USED = 0.7
+# Two mirrored solutions whose misfit is below this explain the session: it lacks evidence and nothing is wrong with it.
+_EXPLAINED_SIGMAS = 6.0
+# A mistake is named instead of an ambiguity only if mending it leaves this share of the misfit.
+_CLEARLY_LESS = 0.3
 # A whole turn in radians, taken for degrees.
 _RADIANS_SPAN = 2.0 * np.pi
 _RANGES = ((1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"), (0.3048, "feet"))
@@ -41,7 +47,7 @@ def with_cause_named(
     session: TurntableSession,
     places: Places,
     left_out: Sequence[LeftOut],
-    assign: Callable[[Places], TurntableObservations],
+    assign: Callable[[Places], Tried],
     solve: Callable[[Places], Solved],
 ) -> UndeterminedError:
     """The error, or one that names its cause.
@@ -53,10 +59,13 @@ def with_cause_named(
     assign, solve
         Scan lines to panels, and the closed form, of some places as they are given; both may raise UndeterminedError.
     """
+    if isinstance(error, AmbiguousError) and error.misfit_sigmas < _EXPLAINED_SIGMAS:
+        return error
     if not places and left_out:
         often, count = Counter(item.reason for item in left_out).most_common(1)[0]
         return UndeterminedError(f"No place can be used: {often} ({count} times)", remedy=error.remedy)
-    cause = _cause(session, places, assign, solve)
+    most = _CLEARLY_LESS * error.misfit_sigmas if isinstance(error, AmbiguousError) else float("inf")
+    cause = _cause(session, places, lambda tried: _fits(tried, assign, most), solve)
     if cause is None:
         return error
     what, remedy = cause
@@ -66,7 +75,7 @@ def with_cause_named(
 def _cause(
     session: TurntableSession,
     places: Places,
-    assign: Callable[[Places], TurntableObservations],
+    fits: Callable[[Places], bool],
     solve: Callable[[Places], Solved],
 ) -> tuple[str, str] | None:
     if not any(place.stripes for place in places):
@@ -77,11 +86,11 @@ def _cause(
             "Check that the table moves and that each row of positions.csv names its own image and scan",
         )
     for factor, unit in _RANGES:
-        if _fits([_scaled(place, factor) for place in places], assign):
+        if fits([_scaled(place, factor) for place in places]):
             return f"The ranges are in {unit}: so taken, the scans fit", "Write the scans in metres"
     for factor, words in _READINGS:
         turned = [replace(p, turntable_angle_rad=factor * p.turntable_angle_rad) for p in places]
-        if _fits(turned, assign):
+        if fits(turned):
             return (
                 f"The turntable's readings are {words}: multiplied by {factor:.4g} they fit",
                 "Write the true readings in degrees into positions.csv",
@@ -119,13 +128,13 @@ def stands_still(places: Places) -> bool:
     return True
 
 
-def _fits(places: Places, assign: Callable[[Places], TurntableObservations]) -> bool:
-    """Whether most places find their scan lines."""
+def _fits(places: Places, assign: Callable[[Places], Tried], most_sigmas: float) -> bool:
+    """Whether most places find their scan lines, with a misfit below the given one."""
     try:
-        found = assign(places)
+        found, misfit_sigmas = assign(places)
     except UndeterminedError:
         return False
-    return len(found.places) >= max(3.0, _MOST_USED * len(places))
+    return found >= max(3.0, _MOST_USED * len(places)) and misfit_sigmas < most_sigmas
 
 
 def _scaled(place: PlaceFeatures, factor: float) -> PlaceFeatures:

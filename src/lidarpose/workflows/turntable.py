@@ -89,10 +89,15 @@ class DetectedFeatures:
 
 @dataclass(frozen=True, eq=False)
 class FittedBefore:
-    """What the assignment has fitted: panels' poses by placement, light planes and stripes by position."""
+    """What the assignment has fitted: panels' poses by placement, light planes and stripes by position.
+
+    `misfit_sigmas` is that of the motion the choice rests on; `against` the evidence that the order stated is against.
+    """
 
     panel_poses: Mapping[str, tuple[PanelPose, ...]]
     stripe_pairs: Mapping[str, StripePair]
+    misfit_sigmas: float = 0.0
+    against: str | None = None
 
 
 def calibrate_turntable(
@@ -167,6 +172,8 @@ def calibrate_turntable(
         calibration,
         quality=checked(calibration, session, features, observations, start[1], estimate, stated),
     )
+    if fitted.against is not None:
+        calibration = replace(calibration, quality=_doubt_order(calibration.quality, fitted.against))
     return TurntableRun(
         method=method,
         session=session,
@@ -206,13 +213,25 @@ def checked(
     return compared(quality, check_sense(calibration.motion, readings, stated))
 
 
+def _doubt_order(quality: Quality | None, against: str) -> Quality | None:
+    """The verdict where the user's order of the lines was taken although evidence speaks for the other one."""
+    if quality is None or quality.verdict == "rejected":
+        return quality
+    reason = (
+        f"--first-panel was taken at its word, but {against} speak for the other order of the scan lines, with which "
+        "the LiDAR stands elsewhere: look at the rig which panel the line of smaller beam angle lies on"
+    )
+    return replace(quality, verdict="doubtful", reasons=(*quality.reasons, reason))
+
+
 def _parts(
     session: TurntableSession, features: DetectedFeatures, first_panel: int | None
-) -> tuple[Callable[[Sequence[PlaceFeatures]], TurntableObservations], Callable[[Sequence[PlaceFeatures]], Solved]]:
+) -> tuple[Callable[[Sequence[PlaceFeatures]], tuple[int, float]], Callable[[Sequence[PlaceFeatures]], Solved]]:
     """Assignment and closed form of some of a session's places."""
 
-    def assign_part(places: Sequence[PlaceFeatures]) -> TurntableObservations:
-        return assign_lines(session, replace(features, places=tuple(places)), first_panel=first_panel)[0]
+    def assign_part(places: Sequence[PlaceFeatures]) -> tuple[int, float]:
+        found, fitted = assign_lines(session, replace(features, places=tuple(places)), first_panel=first_panel)
+        return len(found.places), fitted.misfit_sigmas
 
     def solve_part(places: Sequence[PlaceFeatures]) -> Solved:
         part = replace(features, places=tuple(places))
@@ -467,7 +486,7 @@ def assign_lines(
     assignment = assign(session.camera, panel_poses, features.places, panels=session.panels, first_panel=first_panel)
     left_out = merge_left_out(features.left_out, assignment.left_out)
     return replace(unassigned, places=assignment.places, left_out=left_out), FittedBefore(
-        panel_poses, assignment.stripe_pairs
+        panel_poses, assignment.stripe_pairs, assignment.figures["rms_sigmas"], assignment.against
     )
 
 
