@@ -32,7 +32,7 @@ from lidarpose.model.observation import TurntableObservations
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.session import TurntableSession
 from lidarpose.model.turntable import TurntableMotion
-from lidarpose.refine import turntable_joint
+from lidarpose.refine import joint_equations, turntable_joint
 from lidarpose.refine.least_squares import line_moments
 from lidarpose.refine.turntable import JointOptions, refine_turntable
 from lidarpose.simulate.corner_scene import CornerSceneSpec, simulate_corner_session
@@ -310,7 +310,8 @@ def line_by_line(monkeypatch: pytest.MonkeyPatch) -> None:
             np.outer(row, row)
         return out
 
-    monkeypatch.setattr(turntable_joint, "line_moments", point_by_point)
+    for module in (joint_equations, turntable_joint):
+        monkeypatch.setattr(module, "line_moments", point_by_point)
 
 
 def twice(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from lidarpose.geometry.arrays import FloatArray
+from lidarpose.refine.joint_equations import COMMON_CORNER_SIGMAS_PX, CornerNoise, _add_corners, linearise
 from lidarpose.refine.least_squares import line_columns, line_moments
 from lidarpose.refine.noise import growth_of_scatter, rows_that_count_as_one
 from lidarpose.refine.place_effects import place_effects
-from lidarpose.refine.turntable_joint import COMMON_CORNER_SIGMAS_PX, CornerNoise, _add_corners, linearise
 from lidarpose.refine.turntable_layout import lay_out
 from lidarpose.refine.turntable_parameters import N_GLOBAL
 from lidarpose.refine.turntable_state import start_state

@@ -9,8 +9,8 @@ import pytest
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.rig_family import Family
 from lidarpose.model.turntable import TurntableMotion
+from lidarpose.refine.joint_equations import linearise, lines_of, moved
 from lidarpose.refine.least_squares import line_moments
-from lidarpose.refine.turntable_joint import _moved, linearise, lines_of
 from lidarpose.refine.turntable_layout import JointData, lay_out, thinned
 from lidarpose.refine.turntable_parameters import EXTRAS, N_GLOBAL
 from lidarpose.refine.turntable_state import JointState, motion_map, regular_motion, start_state
@@ -66,19 +66,19 @@ def test_small_steps_are_taken_to_first_order() -> None:
         k: line_moments(r.columns, np.ones(len(r.residual)), lines_of(data, k).start) for k, r in here.lines.items()
     }
     step = 1e-5 * np.random.default_rng(0).standard_normal(N_GLOBAL + 6 * len(data.slots))
-    moved, moved_by = _moved(data, here, state.moved(step, data.centres), step, moments, 1e-4)
-    anew = linearise(data, moved.state)
+    there, moved_by = moved(data, here, state.moved(step, data.centres), step, moments, 1e-4)
+    anew = linearise(data, there.state)
     for kind in moments:
         change = np.abs(anew.lines[kind].residual - here.lines[kind].residual).max()
-        error = np.abs(moved.lines[kind].residual - anew.lines[kind].residual).max()
+        error = np.abs(there.lines[kind].residual - anew.lines[kind].residual).max()
         assert error < 1e-3 * change
-        after = moved.lines[kind]
+        after = there.lines[kind]
         np.testing.assert_array_equal(after.columns[:, -1], after.residual)
         found = line_moments(after.columns, np.ones(len(after.residual)), lines_of(data, kind).start)
         np.testing.assert_allclose(moved_by[kind], found, rtol=1e-9, atol=1e-12 * np.abs(found).max())
     for k, corner in enumerate(anew.corners):
         change = np.abs(corner.residual - here.corners[k].residual).max()
-        assert np.abs(moved.corners[k].residual - corner.residual).max() < 1e-3 * change
+        assert np.abs(there.corners[k].residual - corner.residual).max() < 1e-3 * change
 
 
 def test_range_jacobian_holds_away_from_zero_extras() -> None:

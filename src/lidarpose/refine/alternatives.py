@@ -14,8 +14,9 @@ import numpy as np
 from lidarpose.errors import UndeterminedError
 from lidarpose.model.observation import PanelCorners, PlaceObservation, ScanLine, StripePoints, TurntableObservations
 from lidarpose.model.turntable_result import Kind
+from lidarpose.refine.joint_equations import lines_of
 from lidarpose.refine.joint_options import JointOptions
-from lidarpose.refine.turntable_joint import Solution, lines_of, solve_joint
+from lidarpose.refine.turntable_joint import Solution, solve_joint
 from lidarpose.refine.turntable_layout import lay_out
 from lidarpose.refine.turntable_state import start_state
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.model.turntable_result import Kind
+from lidarpose.refine.joint_equations import all_moments, lines_of, reduced_moments
 from lidarpose.refine.least_squares import NormalEquations
-from lidarpose.refine.turntable_joint import Solution, all_moments, lines_of, reduced_moments
+from lidarpose.refine.turntable_joint import Solution
 from lidarpose.refine.turntable_parameters import N_GLOBAL
 from lidarpose.refine.turntable_residuals import panel_jacobians
 

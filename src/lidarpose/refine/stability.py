@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray
+from lidarpose.refine.joint_equations import Moments, all_moments, lines_of, reduced_moments
 from lidarpose.refine.least_squares import add_lines, covariance_and_condition
 from lidarpose.refine.turntable_estimate import OutsideParameters
-from lidarpose.refine.turntable_joint import Moments, Solution, all_moments, lines_of, reduced_moments
+from lidarpose.refine.turntable_joint import Solution
 from lidarpose.refine.turntable_parameters import N_GLOBAL, N_MOTION
 from lidarpose.refine.turntable_state import motion_map
 

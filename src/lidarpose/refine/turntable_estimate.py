@@ -13,9 +13,10 @@ from lidarpose.geometry.se3 import Pose
 from lidarpose.model.observation import LeftOut, TurntableObservations
 from lidarpose.model.turntable import PARAMETER_NAMES, TurntableMotion
 from lidarpose.model.turntable_result import ExtraParameter, Kind, NoiseEstimate, ResidualGroup
+from lidarpose.refine.joint_equations import lines_of
 from lidarpose.refine.joint_options import JointOptions
 from lidarpose.refine.observability import pose_spread, weak_directions, whole_turn
-from lidarpose.refine.turntable_joint import Solution, lines_of
+from lidarpose.refine.turntable_joint import Solution
 from lidarpose.refine.turntable_layout import Slot
 from lidarpose.refine.turntable_parameters import EXTRAS, N_GLOBAL, N_MOTION
 from lidarpose.refine.turntable_state import motion_map
