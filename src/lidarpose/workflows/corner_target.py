@@ -13,6 +13,7 @@ import numpy as np
 from lidarpose.detect.cloud_planes import PlaneSearch, segment_planes
 from lidarpose.detect.crop import inside_box
 from lidarpose.detect.edge_corner import find_edge_corners
+from lidarpose.detect.noisy_planes import segment_noisy_planes
 from lidarpose.detect.trihedral_corner import FaceMask, find_corners
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray, IntArray
@@ -38,7 +39,9 @@ from lidarpose.workflows.moving_target import MIN_FACE_RETURNS, find_by_motion, 
 HINT_CROP_M = 1.5
 # A face in a single frame: at the first look, and at later ones where no target was found.
 FACE_RETURNS, FEWEST_FACE_RETURNS = 30, 15
-LOOKS = 4
+LOOKS, NOISY_LOOKS = 4, 2
+# Where they fail, so many frames of a place at most, and points, are looked at together.
+STACKED_FRAMES, STACKED_POINTS = 20, 300_000
 GATE_SIGMAS = 6.5
 FIRST_GATE_M = 0.05
 # The share of a face next to the corner on which the first fit stands, before its far edges are trusted.
@@ -205,12 +208,26 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
             frame = attempt * len(place.clouds) // LOOKS
             candidates[k] += place_corners(place, seed + attempt, frame, FEWEST_FACE_RETURNS)
         matches, world, oddity = _match_with_mistakes(candidates, world_coordinates(session), session.estimate_scale)
+    for attempt in range(NOISY_LOOKS):
+        missing = _missing(matches, len(world))
+        if not missing:
+            break
+        for k in missing:
+            candidates[k] += noisy_corners(session.places[k], session.lidar.range_sigma_m, seed + attempt)
+        matches, world, oddity = _match_with_mistakes(candidates, world_coordinates(session), session.estimate_scale)
     if not matches:
         by_edges = _find_by_edges(session, seed)
         if by_edges is None:
             raise _not_found(session, candidates)
         return by_edges
     return _found(session, candidates, matches, world, oddity)
+
+
+def _missing(matches: Sequence[CornerMatch], count: int) -> list[int]:
+    """The places without a corner; all of them where fewer than half have one, which chance may do."""
+    if not matches or 2 * matches[0].places < count:
+        return list(range(count))
+    return [k for k in range(count) if matches[0].choice[k] is None]
 
 
 def _find_by_edges(session: CornerSession, seed: int) -> FoundTarget | None:
@@ -274,6 +291,17 @@ def place_corners(
     """All corners in one frame of a place, or those near the hint, of faces with `min_points` returns or more."""
     points = _near_hint(load_points(place.clouds[frame]), place)
     patches = segment_planes(points, PlaneSearch(min_points=min_points, from_sensor=True, seed=seed))
+    return find_corners(points, patches, place.near, NEAR_RADIUS_M)
+
+
+def noisy_corners(place: CornerPlace, range_sigma_m: float | None, seed: int = 0) -> tuple[CornerCandidate, ...]:
+    """All corners at a place, or those near the hint, whose faces are noisy beside their size, or have but few returns
+    in a frame: all frames are looked at together."""
+    first = _near_hint(load_points(place.clouds[0]), place)
+    count = int(np.clip(STACKED_POINTS // max(len(first), 1), 1, min(STACKED_FRAMES, len(place.clouds))))
+    others = np.linspace(0, len(place.clouds) - 1, count).round().astype(int)[1:].tolist()
+    points = np.concatenate([first, *(_near_hint(load_points(place.clouds[k]), place) for k in others)])
+    patches = segment_noisy_planes(points, range_sigma_m=range_sigma_m, min_points=FEWEST_FACE_RETURNS, seed=seed)
     return find_corners(points, patches, place.near, NEAR_RADIUS_M)
 
 
