@@ -12,7 +12,8 @@ import pytest
 
 from lidarpose.model.world_run import WorldRun
 from lidarpose.report.world_page import world_page
-from lidarpose.simulate.corner_scene import CornerSceneSpec
+from lidarpose.simulate.corner_scene import CornerSceneSpec, simulate_corner_session
+from lidarpose.workflows.world import world_run
 from tests_support.browser import Browser
 from tests_support.page_checks import assert_sound, scene_ink, scene_middle
 from tests_support.world_runs import simulated_world_run
@@ -60,8 +61,23 @@ def test_good_page_tells_its_numbers(runs: dict[str, WorldRun]) -> None:
 def test_bad_page_names_the_place_at_fault(runs: dict[str, WorldRun]) -> None:
     text = world_page(runs["bad"])
     verdict = text[text.index('id="verdict"') : text.index('class="tiles"')]
+    assert "Doubtful" in verdict
+    assert "P02 is left out" in verdict
+    assert "row 3 of the positions would fit with -60, +0, -0 mm" in verdict
+
+
+def test_rejected_page_names_the_swapped_rows() -> None:
+    session, _ = simulate_corner_session(CornerSceneSpec(frames=1, places=5))
+    first, second, *others = session.places
+    swapped = (
+        replace(first, corner_world=second.corner_world),
+        replace(second, corner_world=first.corner_world),
+        *others,
+    )
+    text = world_page(world_run(replace(session, places=swapped)))
+    verdict = text[text.index('id="verdict"') : text.index('class="tiles"')]
     assert "Rejected" in verdict
-    assert "Look at place p02 first" in verdict
+    assert "The rows 1 and 2 of the positions look swapped" in verdict
 
 
 def test_kept_run_holds_the_faces_and_their_corner(runs: dict[str, WorldRun]) -> None:
