@@ -263,6 +263,20 @@ def test_places_in_one_plane_that_turn_the_sensor_upside_down_are_doubted(simula
     assert "upside down" in reasons(calibrate_world(with_world(few, world)))
 
 
+def test_three_places_in_a_slanted_plane_that_turn_the_sensor_over_are_doubted() -> None:
+    # Their plane is 26 degrees from level.
+    pose = Pose(paper_rotation(9.31806, -5.05184, 8.86981), np.array([0.004539, 0.996407, 1.5]))
+    spec = CornerSceneSpec(pose=pose, places=3, frames=1, seed=7002, ground_m=0.0, size_m=0.6013956, clutter=9)
+    session, truth = simulate_corner_session(spec)
+    right = calibrate_world(session)
+    assert right.T_world_source.distance(truth.T_world_lidar)[0] < 0.005
+    assert right.quality is not None
+    assert right.quality.verdict == "good"
+    world = np.stack([p.corner_world for p in session.places])
+    for mirrored in (world * [1.0, -1.0, 1.0], world[:, [1, 0, 2]]):
+        assert "left-handed" in reasons(calibrate_world(with_world(session, mirrored)))
+
+
 def test_a_target_that_stands_still_is_no_answer(simulated: Simulated) -> None:
     session, _, _ = simulated
     still = tuple(replace(p, clouds=session.places[0].clouds) for p in session.places)

@@ -30,6 +30,8 @@ NOISE_RATIO_DOUBTFUL = 3.0
 LEAST_MISFIT_M = 0.002
 # A crossing that the data leave open is named where it is at least so likely, and moves the pose so far beyond chance.
 OPEN_CHANCE, OPEN_SIGMAS = 0.05, 3.0
+# The z of the sensor's up: so low is odd where one reflected in the places' plane stands so much straighter.
+MOST_TILTED, MORE_UPRIGHT = 0.5, 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,11 +264,15 @@ def _judge_handedness(
     if flat_sigma > 0.02:
         return
     up = np.array([0.0, 0.0, 1.0]) if evidence.cloud_frame == "lidar" else np.array([0.0, -1.0, 0.0])
+    upright = float((pose.rotation @ up)[2])
+    # With x and y exchanged, or one of them turned round, the corners fit as well, by a pose reflected in their plane.
     normal = np.linalg.svd(cw)[2][2]
-    if abs(normal[2]) > 0.9 and (pose.rotation @ up)[2] < -0.2:
+    otherwise = upright - 2.0 * float(normal @ pose.rotation @ up) * float(normal[2])
+    if upright < MOST_TILTED and otherwise > upright + MORE_UPRIGHT:
+        turns = "turns the sensor upside down" if upright < 0.0 else "lays the sensor on its side"
         verdict.doubt(
-            "all places lie in one plane, and the result turns the sensor upside down: either it hangs so (or the "
-            "world's z points down), or the world coordinates are left-handed; a place at another height tells"
+            f"all places lie in one plane, and the result {turns}: either it is mounted so (or the "
+            "world's z points down), or the world coordinates are left-handed; a place off that plane tells"
         )
 
 
