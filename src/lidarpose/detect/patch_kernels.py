@@ -314,8 +314,8 @@ def moments(local: Any, inside: Any) -> Any:
 
 
 @kernel
-def _axes(normal: Any) -> Any:
-    """`geometry.arrays.perpendicular_pair`, as rows (2, 3)."""
+def pair_across(normal: Any) -> Any:
+    """`geometry.arrays.perpendicular_pair` of the first three numbers of a normal or plane, as rows (2, 3)."""
     length = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
     x, y, z = normal[0] / length, normal[1] / length, normal[2] / length
     p, q, r = 0.0, -z, y
@@ -359,7 +359,7 @@ def improved(
             plane[axis] = sign * axes[axis, 0]
         plane[3] = sign * offset
         _, inside = _near_plane(points, plane, plane[3], gate)
-        found = largest_piece(points, (inside > 0) & active, _axes(plane), gap, share, most)
+        found = largest_piece(points, (inside > 0) & active, pair_across(plane), gap, share, most)
         same = True
         for i in range(len(found)):
             same = same and found[i] == component[i]
@@ -506,7 +506,7 @@ def refitted(
     their spread. `gates`, `limits` and `counts` are the thresholds that `cloud_planes` has gathered.
     """
     nothing = np.empty(0, np.int64)
-    axes, cell_m = _axes(plane), cell_size(seen, gap, share)
+    axes, cell_m = pair_across(plane), cell_size(seen, gap, share)
     allowed, origin = _cells_around(seen, axes, cell_m, most)
     centre, normal = np.empty(3), plane[:3].copy()
     for axis in range(3):

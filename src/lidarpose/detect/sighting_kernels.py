@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.detect.patch_kernels import eigen
+from lidarpose.detect.patch_kernels import eigen, pair_across
 from lidarpose.detect.target_kernels import faces_met, points_in_box
 from lidarpose.geometry.compiled import kernel
 
@@ -286,27 +286,9 @@ def farthest(points: Any, directions: Any) -> Any:
 
 
 @kernel
-def _across(normal: Any) -> Any:
-    """`geometry.arrays.perpendicular_pair`, as rows (2, 3)."""
-    length = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
-    x, y, z = normal[0] / length, normal[1] / length, normal[2] / length
-    p, q, r = 0.0, -z, y
-    if abs(y) < abs(x):
-        p, q, r = z, 0.0, -x
-    if abs(z) < min(abs(x), abs(y)):
-        p, q, r = -y, x, 0.0
-    across = np.sqrt(p * p + q * q + r * r)
-    p, q, r = p / across, q / across, r / across
-    pair = np.empty((2, 3))
-    pair[0, 0], pair[0, 1], pair[0, 2] = p, q, r
-    pair[1, 0], pair[1, 1], pair[1, 2] = y * r - z * q, z * p - x * r, x * q - y * p
-    return pair
-
-
-@kernel
 def _outline(points: Any, plane: Any, around: Any) -> Any:
     """`trihedral_corner.convex_outline` of points (N, 3) on a plane (4,), from the directions around it (D, 2)."""
-    pair = _across(plane)
+    pair = pair_across(plane)
     directions = np.empty((len(around), 3))
     for d in range(len(around)):
         for axis in range(3):
