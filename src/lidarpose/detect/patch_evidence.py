@@ -23,7 +23,8 @@ WIDEST = 3.0
 STANDS_OUT = 0.7
 THIN = 0.15
 EVIDENCE_POINTS = 60_000
-# The second screening: neighbours that make a point's own normal, points asked, and how many have to agree how well.
+# The second screening: neighbours that make a point's own normal, points asked (up to twice as many where they do not
+# divide evenly), and how many have to agree how well.
 SCREENING_NEIGHBOURS = 12
 SCREENING_WIDTH = 1.5
 LINED_UP = 0.15
@@ -93,7 +94,7 @@ def _neighbours_agree(points: Float32Array, normal: FloatArray, sigma_m: float) 
     two thirds are such, nobody is asked."""
     if len(points) <= SCREENING_NEIGHBOURS:
         return True
-    seeds = points[:: -(-len(points) // SCREENED_POINTS)]
+    seeds = points[:: max(len(points) // SCREENED_POINTS, 1)]
     if pays(0.0, KERNELS):
         from lidarpose.detect.patch_kernels import nearest
 

@@ -448,7 +448,7 @@ def _agree(points: Any, normal: Any, sigma: float, limits: Any, counts: Any) -> 
     neighbours, asked_points = counts[0], counts[1]
     if len(points) <= neighbours:
         return True
-    seeds = points[:: -(-len(points) // asked_points)].copy()
+    seeds = points[:: max(len(points) // asked_points, 1)].copy()
     found = nearest(points, seeds, neighbours)
     chosen = np.empty((len(seeds), neighbours, 3), np.float32)
     for s in range(len(seeds)):
