@@ -30,6 +30,7 @@ from lidarpose.storage.clouds import (
 )
 
 BINARY = (".ply", ".pcd", ".las", ".laz", ".e57", ".npy")
+WRITTEN = tuple(suffix for suffix in CLOUD_SUFFIXES if suffix != ".pts")
 
 
 def make_cloud(n: int = 500, dtype: type = np.float32, seed: int = 0) -> Cloud:
@@ -56,12 +57,12 @@ def assert_same(found: Cloud, wanted: Cloud, *, metres: float = 0.0, exact_types
         np.testing.assert_array_equal(found.fields[name].astype(column.dtype), column, err_msg=name)
 
 
-@pytest.mark.parametrize("suffix", CLOUD_SUFFIXES)
+@pytest.mark.parametrize("suffix", WRITTEN)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_every_format_keeps_points_and_fields(tmp_path: Path, suffix: str, dtype: type) -> None:
     cloud = make_cloud(dtype=dtype)
     write_cloud(tmp_path / f"a{suffix}", cloud)
-    text = suffix in (".xyz", ".txt", ".csv")
+    text = suffix in (".xyz", ".txt", ".csv", ".asc")
     tolerance = 0.51e-5 if suffix in (".las", ".laz") else 1e-7 if text else 0.0
     found = read_cloud(tmp_path / f"a{suffix}")
     assert_same(found, cloud, metres=tolerance, exact_types=not text)
@@ -70,7 +71,7 @@ def test_every_format_keeps_points_and_fields(tmp_path: Path, suffix: str, dtype
     assert [path.name for path in tmp_path.iterdir()] == [f"a{suffix}"]
 
 
-@pytest.mark.parametrize("suffix", CLOUD_SUFFIXES)
+@pytest.mark.parametrize("suffix", WRITTEN)
 def test_appended_parts_make_one_cloud(tmp_path: Path, suffix: str) -> None:
     cloud = make_cloud(1000)
     types = {name: column.dtype for name, column in cloud.fields.items()}
@@ -380,10 +381,19 @@ def _written(path: Path, cloud: Cloud) -> Path:
         ("X;Y;Z;ring\n1;2;3;4\n4;5;6;5\n", {"ring"}),
         ("// made elsewhere\n1\t2\t3\n4\t5\t6\r\n", set()),
         ("x_m,y_m,z_m,intensity\n1,2,3,4\n4,5,6,5\n", {"intensity"}),
+        ("\ufeffx,y,z\n1,2,3\n4,5,6\n", set()),
+        ("x;y;z\n1,0;2,0;3,0\n4,0;5,0;6,0\n", set()),
+        ("1,0 2,0 3,0\n4,0 5,0 6,0\n", set()),
+        ("x\ty\tz\tring\n1,0\t2,0\t3,0\t1\n4,0\t5,0\t6,0\t2\n", {"ring"}),
+        ("2\n1 2 3 -100\n4 5 6 -200\n", {"column_4"}),
+        ("//X,Y,Z,ring\n2\n1,2,3,1\n4,5,6,1\n", {"ring"}),
+        ("1 2 3  # first\n4 5 6\n# end\n", set()),
+        ('"Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2","ring"\n1,2,3,0\n4,5,6,0\n', {"ring"}),
+        (",x [m],y [m],z (m),\n0,1,2,3,\n1,4,5,6,\n", {"column_1"}),
     ],
 )
 def test_text_in_the_ways_people_write_it(tmp_path: Path, text: str, names: set[str]) -> None:
-    (tmp_path / "a.xyz").write_text(text)
+    (tmp_path / "a.xyz").write_text(text, encoding="utf-8")
     cloud = read_cloud(tmp_path / "a.xyz")
     np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
     assert set(cloud.fields) == names
@@ -391,10 +401,14 @@ def test_text_in_the_ways_people_write_it(tmp_path: Path, text: str, names: set[
 
 @pytest.mark.parametrize(
     "text",
-    ["", "hello\n", "1 2\n", "1 2 3\n4 5\n", "1 2 3\n4 5 x\n", "# x y z\n", "\0\0\0", "a b c\n", ",", ";;\n1 2 3\n"],
+    [
+        *("", "hello\n", "1 2\n", "1 2 3\n4 5\n", "1 2 3\n4 5 x\n", "# x y z\n", "\0\0\0", "a b c\n", ","),
+        *("3\n1 2 3\n4 5 6\n", "1,234.5 2,345.5 3,456.5\n", "4 5 6\n1,5 2,5 3,0\n", "\ufeff"),
+        *(";;\n1 2 3\n", "x_mm,y_mm,z_mm\n1,2,3\n", "1\n2\n3\n", "1.0 2.0 3.0\n\n1,2,3\n", "1,2,3 4\n"),
+    ],
 )
 def test_text_that_is_no_cloud(tmp_path: Path, text: str) -> None:
-    (tmp_path / "a.xyz").write_text(text)
+    (tmp_path / "a.xyz").write_text(text, encoding="utf-8")
     if text == "# x y z\n":
         with pytest.raises(InputError, match="no points"):
             read_cloud(tmp_path / "a.xyz")
@@ -419,14 +433,14 @@ def _fail_half_way(path: Path) -> None:
 
 
 def test_a_writer_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
-    for suffix in CLOUD_SUFFIXES:
+    for suffix in WRITTEN:
         path = tmp_path / f"a{suffix}"
         write_cloud(path, make_cloud(10))
         before = path.read_bytes()
         with pytest.raises(RuntimeError, match="half-way"):
             _fail_half_way(path)
         assert path.read_bytes() == before
-    assert len(list(tmp_path.iterdir())) == len(CLOUD_SUFFIXES)
+    assert len(list(tmp_path.iterdir())) == len(WRITTEN)
 
 
 @pytest.mark.parametrize("suffix", ["pcd", "ply", "npy"])
@@ -468,7 +482,7 @@ def test_millimetres_are_noticed() -> None:
     assert not looks_like_millimetres(Cloud(np.full((3, 3), np.nan)))
 
 
-@pytest.mark.parametrize("suffix", CLOUD_SUFFIXES)
+@pytest.mark.parametrize("suffix", WRITTEN)
 def test_points_that_are_only_looked_at_are_those_that_are_read(tmp_path: Path, suffix: str) -> None:
     """Of files with further columns and without, one after the other, so that lent memory is used again."""
     for name, cloud in (("a", make_cloud(700)), ("b", Cloud(make_cloud(300).points)), ("c", Cloud(np.zeros((1, 3))))):

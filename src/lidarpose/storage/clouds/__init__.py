@@ -34,6 +34,8 @@ _FORMATS = {
     ".xyz": "xyz",
     ".txt": "xyz",
     ".csv": "xyz",
+    ".pts": "xyz",
+    ".asc": "xyz",
 }
 CLOUD_SUFFIXES = tuple(_FORMATS)
 """The suffixes that name a cloud, in lower case."""

@@ -262,7 +262,9 @@ def blocks(count: int, rows: int) -> Iterator[slice]:
         yield slice(start, min(start + rows, count))
 
 
-def parse_table(path: Path, file: IO[bytes], dtype: np.dtype[Any], count: int | None) -> NDArray[Any]:
+def parse_table(
+    path: Path, file: IO[bytes], dtype: np.dtype[Any], count: int | None, *, comments: str | None = None
+) -> NDArray[Any]:
     """Rows (N,) of whitespace-separated numbers from where `file` stands, one line each; blank lines are no rows.
 
     Parameters
@@ -271,6 +273,8 @@ def parse_table(path: Path, file: IO[bytes], dtype: np.dtype[Any], count: int | 
         Structured; sub-arrays take as many numbers as they have elements.
     count
         How many rows to read; None reads to the end of the file.
+    comments
+        What begins the part of a line that is passed over.
 
     Raises
     ------
@@ -283,7 +287,7 @@ def parse_table(path: Path, file: IO[bytes], dtype: np.dtype[Any], count: int | 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # "no data": the count says so below
             warnings.simplefilter("error", DeprecationWarning)  # a float where an integer belongs
-            rows = np.loadtxt(text, dtype=dtype, comments=None, max_rows=count, ndmin=1)
+            rows = np.loadtxt(text, dtype=dtype, comments=comments, max_rows=count, ndmin=1)
     except (ValueError, OverflowError, TypeError, DeprecationWarning) as error:
         wanted = sum(int(np.prod(dtype[name].shape)) for name in dtype.names or ())
         # numpy counts from 0 where it names the column, too, and from 1 elsewhere.
