@@ -19,7 +19,7 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks.timing import Contest, beside
+from benchmarks.timing import Contest, beside, lidarpose_calibrate, python
 from lidarpose.geometry.compiled import forced, installed
 from lidarpose.report.turntable_page import turntable_page
 from lidarpose.storage.session import read_turntable_session
@@ -60,14 +60,6 @@ def by_numpy(folder: Path, *, report: bool) -> None:
         calibrate(folder, report=report)
 
 
-def command(folder: Path, *options: str) -> None:
-    """The command itself, in a new process, with its byte code at hand as in every installation."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    with tempfile.TemporaryDirectory() as out:
-        arguments = [sys.executable, "-m", "lidarpose", "calibrate", str(folder), "-o", out, "--quiet", *options]
-        subprocess.run(arguments, check=True, stdout=subprocess.DEVNULL, env=environment)
-
-
 def start(folder: Path) -> None:
     """What a command does, in a new process, before its images can be shared: start, import, read the session."""
     code = (
@@ -77,7 +69,24 @@ def start(folder: Path) -> None:
         "import lidarpose.workflows.turntable; from lidarpose.storage.session import read_turntable_session as read; "
     )
     code += "import sys; from pathlib import Path; read(Path(sys.argv[1]))"
-    subprocess.run([sys.executable, "-c", code, str(folder)], check=True)
+    python("-c", code, str(folder))
+
+
+def decode_alone(folder: Path) -> None:
+    """What `decode` does, in a new process that imports nothing for anything else."""
+    python("-c", _DECODE_ALONE, str(folder))
+
+
+_DECODE_ALONE = """
+import os, sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+import cv2
+cv2.setNumThreads(1)
+files = sorted(Path(sys.argv[1]).glob("**/*.png"))
+with ThreadPoolExecutor(os.cpu_count()) as executor:
+    assert all(image is not None for image in executor.map(lambda path: cv2.imread(str(path), 0), files))
+"""
 
 
 def decode_fastest(folder: Path) -> None:
@@ -111,6 +120,7 @@ DECODING = "decoding the images alone"
 PLAIN, REPORT = "calibrate, modules and kernels loaded, no report", "calibrate, modules and kernels loaded, report"
 FASTEST = "decoding by the fastest decoder, shared by forked processes"
 BY_NUMPY = "the same by NumPy, no report"
+DECODING_ALONE = "a new process that decodes the images by OpenCV and does nothing else"
 START = "a new process until its images can be shared: start, imports, session read"
 STAGES = (
     "of that: boards, scan lines and stripes with decoding, all cores",
@@ -134,6 +144,11 @@ def least_command_over(found: Contest, places: int = PLACES) -> float:
     return least_over(found, places) + found.over[START]
 
 
+def over_process(found: Contest, name: str) -> float:
+    """A command over a process that only decodes: both with their start and imports."""
+    return found.over[name] / found.over[DECODING_ALONE]
+
+
 def measure(folder: Path, repeats: int = REPEATS) -> Contest:
     """Every way beside decoding, all of them in turn."""
     ways: dict[str, Callable[[], None]] = {
@@ -143,14 +158,15 @@ def measure(folder: Path, repeats: int = REPEATS) -> Contest:
         BY_NUMPY: lambda: by_numpy(folder, report=False),
         "the same by NumPy, report": lambda: by_numpy(folder, report=True),
         START: lambda: start(folder),
-        PLAIN_COMMAND: lambda: command(folder, "--no-report"),
-        COMMAND: lambda: command(folder),
+        DECODING_ALONE: lambda: decode_alone(folder),
+        PLAIN_COMMAND: lambda: lidarpose_calibrate(folder, "--no-report"),
+        COMMAND: lambda: lidarpose_calibrate(folder),
     }
     # What runs on comes to kernels by itself, after three sessions of this size; without numba there are none.
     with forced(installed()):
         calibrate(folder, report=True)
     calibrate(folder, report=True)
-    command(folder)
+    lidarpose_calibrate(folder)
     decode(folder)
     return beside(lambda: decode(folder), ways, repeats)
 
@@ -166,6 +182,8 @@ def main() -> None:
     print(f"{DECODING:70s} {found.reference_s:8.2f} {1.0:6.2f}")
     for name, value in found.seconds.items():
         print(f"{name:70s} {value:8.2f} {found.over[name]:6.2f}")
+    for name in (PLAIN_COMMAND, COMMAND):
+        print(f"{name + ', over a process that decodes':70s} {'':8s} {over_process(found, name):6.2f}")
     print(f"{'the least that any such job takes here':70s} {'':8s} {least_over(found):6.2f}")
     print(f"{'the least that any such command takes here':70s} {'':8s} {least_command_over(found):6.2f}")
 

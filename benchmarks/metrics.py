@@ -113,12 +113,20 @@ _CALIBRATE = (
 )
 _COMMAND = (
     "As for `calibrate`, and: a command starts, imports and reads its session before anything can be shared (NumPy "
-    "and the command line's parser are two fifths of it), and has no kernels: importing numba takes 0.36 s and "
-    "loading them 0.05 s, before it forks, and saves each of two processes 0.15 s. `calibrate.least_command` is that "
-    "start and `calibrate.least`. Stripes by NumPy add 0.25 of decoding to it, boards and scan lines 0.25, the part "
-    "on one core 0.3: together above 1.3.\n"
+    "and the command line's parser are two fifths of it). That start took 0.29 of decoding on an idle machine, and "
+    "`calibrate` in a process that has its kernels 1.26: together 1.55, above 1.3 whatever kernels would cost. They "
+    "cost more than they bring: importing numba takes 0.36 s and loading them 0.05 s, before the command forks, and "
+    "saves each of two processes 0.15 s; a command forced to take them took 1.93 s in place of 1.54 (six runs of "
+    "each in turn). So it searches by NumPy: stripes add 0.25 of decoding, boards and scan lines 0.25, the part on one "
+    "core 0.3. `calibrate.least_command` is the start and `calibrate.least`. Against a process that only decodes "
+    "(`calibrate.plain_process`) the reference has its own start, Python and the import of OpenCV, in it as well.\n"
     "Tried: sessions read without pydantic (0.05 s), which is imported where something is wrong with them; what only "
     "the result needs imported while others search images; no search for garbage at the end."
+)
+_FRAMES_COMMAND = (
+    "Both processes start Python, import NumPy and the readers and read all frames, which is half of what the reading "
+    "process takes. The command imports its line's parser, the methods and the printing beside it, and does the job "
+    "by NumPy, as `calibrate` with modules loaded above: loading kernels would take longer than they save."
 )
 _FRAMES = (
     "Kernels are what a process that runs on has; a single run takes NumPy's way and does not wait for them. "
@@ -175,6 +183,15 @@ METRICS: tuple[Metric, ...] = (
         bound=_COMMAND,
     ),
     Metric("calibrate.plain_command", "the same with `--no-report`", "x", 0.25, 1.3, bound=_COMMAND),
+    Metric(
+        "calibrate.report_process",
+        "the whole command, over a new process that only decodes the images",
+        "x",
+        0.25,
+        2.0,
+        bound=_COMMAND,
+    ),
+    Metric("calibrate.plain_process", "the same with `--no-report`", "x", 0.25, 1.3, bound=_COMMAND),
     # Boards and stripes
     Metric("boards.s", "both boards of one image", "s", 0.3, 0.1),
     Metric("boards.error", "RMS error of their corners, over OpenCV's SB with ACCURACY", "x", 0.02, 1.0),
@@ -224,6 +241,16 @@ METRICS: tuple[Metric, ...] = (
     Metric("world.cut_least", "of cutting, the files' bytes alone, on all cores", "x", 0.3),
     Metric("world.kernels_least", "what cannot be left out, by kernels", "x", 0.3),
     Metric("world.open3d_reading", "`calibrate` of them, over Open3D's reading of the same files", "x", 0.4),
+    Metric(
+        "world.process",
+        "the whole command on these frames, over a new process that only reads them",
+        "x",
+        0.3,
+        2.0,
+        bound=_FRAMES_COMMAND,
+    ),
+    Metric("world.process_plain", "the same with `--no-report`", "x", 0.3, 2.0, bound=_FRAMES_COMMAND),
+    Metric("world.process_open3d", "the whole command, over a new process that only reads them with Open3D", "x", 0.3),
     # Growth
     _exponent("growth.places_s", "exponent of calibrate's processor time over places"),
     _exponent("growth.places_mb", "exponent of its memory over places"),

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -147,6 +149,18 @@ def peak_of(work: Work) -> tuple[float, float]:
 def _status_mb(name: str) -> float:
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith(name)).split()[1]) / 1024
+
+
+def python(*arguments: str) -> None:
+    """A new process of this Python from its start to its end, with its byte code at hand as in every installation."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL, env=environment)
+
+
+def lidarpose_calibrate(session: Path, *options: str) -> None:
+    """The command as a user calls it, in a new process; its results are thrown away."""
+    with tempfile.TemporaryDirectory() as out:
+        python("-m", "lidarpose", "calibrate", str(session), "-o", out, "--quiet", *options)
 
 
 def in_child(module: str, *arguments: str) -> Any:

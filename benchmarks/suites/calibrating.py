@@ -20,6 +20,7 @@ from benchmarks.calibrate import (
     least_command_over,
     least_over,
     measure,
+    over_process,
     simulate,
     stages,
 )
@@ -45,6 +46,8 @@ def run(effort: Effort) -> Report:
         "calibrate.plain": found.over[PLAIN],
         "calibrate.report_command": found.over[COMMAND],
         "calibrate.plain_command": found.over[PLAIN_COMMAND],
+        "calibrate.report_process": over_process(found, COMMAND),
+        "calibrate.plain_process": over_process(found, PLAIN_COMMAND),
     }
     rows: list[list[Cell]] = [[DECODING, found.reference_s, 1.0]]
     for name, value in found.seconds.items():
@@ -54,6 +57,7 @@ def run(effort: Effort) -> Report:
             rows += [[part, value, value / found.reference_s] for part, value in medians.items()]
     text = (
         "A simulated session of the turntable paper's set-up, 1624 x 1234 pixels, PNG. Decoding is OpenCV's, a thread "
-        "a core. Parts are of runs of their own. The last two lines are whole processes, start and imports included."
+        "a core. Parts are of runs of their own. Lines of a new process and the last two are whole processes, "
+        "start and imports included."
     )
     return Report(figures, [Table("Calibrating a turntable", ["work", "s", "over decoding"], rows, text)])

@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.peers import peer
 from benchmarks.report import Cell, Effort, Report, Table
 from benchmarks.suites.files import touched
-from benchmarks.timing import beside
+from benchmarks.timing import Contest, beside, lidarpose_calibrate, python
 from lidarpose.detect.moved_points import moved_points
 from lidarpose.geometry.compiled import forced, installed
 from lidarpose.geometry.threads import one_blas_thread
@@ -44,6 +44,7 @@ def run(effort: Effort) -> Report:
         for work in (lambda: _read(read_corner_session(folder)), *works.values()):
             work()
         found = beside(lambda: _read(read_corner_session(folder)), works, effort.pick(15, 1), least_s=0.2)
+        processes = _processes(folder, effort.pick(9, 1))
     metres, _ = result.T_world_source.distance(truth.T_world_lidar)
     points = sum(len(p.clouds[0].load()) for p in session.places) * frames
     text = f"{PLACES} places, {frames} frames each, {points} points in all; the answer is {1e3 * metres:.2f} mm off."
@@ -52,7 +53,16 @@ def run(effort: Effort) -> Report:
     figures = {figure: found.over[name] for figure, name in _FIGURES.items() if name in found.over}
     if OPEN3D in found.over:
         figures["world.open3d_reading"] = found.over[FIRST] / found.over[OPEN3D]
-    return Report(figures, [Table("The world job", ["work", "s", "over reading"], rows, text)])
+    figures |= {figure: processes.over[name] for figure, name in _PROCESS_FIGURES.items()}
+    if OPEN3D_PROCESS in processes.over:
+        figures["world.process_open3d"] = processes.over[COMMAND] / processes.over[OPEN3D_PROCESS]
+    whole: list[list[Cell]] = [["a process that reads the frames and does nothing else", processes.reference_s, 1.0]]
+    whole += [[name, value, processes.over[name]] for name, value in processes.seconds.items()]
+    tables = [
+        Table("The world job", ["work", "s", "over reading"], rows, text),
+        Table("The world job as a command", ["process", "s", "over reading"], whole, _PROCESSES),
+    ]
+    return Report(figures, tables)
 
 
 FIRST = "calibrate, modules loaded"
@@ -79,6 +89,44 @@ _FIGURES = {
     "world.cut_least": BYTES,
 }
 OPEN3D = "Open3D's `read_point_cloud` of the same frames"
+
+
+PLAIN_COMMAND, COMMAND = "lidarpose calibrate --no-report", "lidarpose calibrate"
+OPEN3D_PROCESS = "a process that reads them with Open3D and does nothing else"
+_PROCESS_FIGURES = {"world.process": COMMAND, "world.process_plain": PLAIN_COMMAND}
+_PROCESSES = (
+    "The same session by whole processes, Python's start and all imports included on both sides: what a user waits "
+    "for, against what he would wait for if the frames were read and no more."
+)
+_READING_ALONE = """
+import sys
+from pathlib import Path
+from lidarpose.storage.corner_session import read_corner_session
+session = read_corner_session(Path(sys.argv[1]))
+sum(float(source.load().points.sum()) for place in session.places for source in place.clouds)
+"""
+_OPEN3D_ALONE = """
+import sys
+from pathlib import Path
+import numpy as np
+import open3d as o3d
+paths = sorted(Path(sys.argv[1]).rglob("*.pcd"))
+sum(float(np.asarray(o3d.io.read_point_cloud(str(path)).points).sum()) for path in paths)
+"""
+
+
+def _processes(folder: Path, repeats: int) -> Contest:
+    """Commands beside a process that only reads the frames, by our reader and by Open3D's."""
+    ways: dict[str, Callable[[], object]] = {
+        PLAIN_COMMAND: lambda: lidarpose_calibrate(folder, "--no-report"),
+        COMMAND: lambda: lidarpose_calibrate(folder),
+    }
+    if peer("open3d") is not None:
+        ways[OPEN3D_PROCESS] = lambda: python("-c", _OPEN3D_ALONE, str(folder))
+    works = [lambda: python("-c", _READING_ALONE, str(folder)), *ways.values()]
+    for work in works:
+        work()
+    return beside(works[0], ways, repeats)
 
 
 def _calibrate(folder: Path, way: bool) -> object:
