@@ -44,8 +44,8 @@ STEPS = 8
 
 @dataclass(frozen=True, eq=False)
 class SlippedPlace:
-    """The place that the others disagree with, among those of the estimate, and its coordinates' errors (3,), metres,
-    by the others."""
+    """The place that the others disagree with, among those of the estimate, and what its coordinates lack by the others
+    (3,), metres."""
 
     place: int
     off: FloatArray
@@ -127,6 +127,7 @@ def _misfit(world: FloatArray, corners: FloatArray, covariances: FloatArray, use
         if before - total < 1e-3 * total:
             break
         JtW = J.transpose(0, 2, 1) @ weight
-        step = np.linalg.solve((JtW @ J).sum(axis=0), (JtW @ miss[..., None]).sum(axis=0)[:, 0])
+        # Corners on one line leave a turn about it open: the shortest step of all then.
+        step = np.linalg.lstsq((JtW @ J).sum(axis=0), (JtW @ miss[..., None]).sum(axis=0)[:, 0], rcond=1e-12)[0]
         pose = Pose.exp(step) @ pose
     return total, pose
