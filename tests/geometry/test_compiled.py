@@ -132,6 +132,29 @@ print(compiled._stored("measure.kernels"))
     assert done.stdout.split() == ["False", "True", "False", "False"]
 
 
+@pytest.mark.skipif(not compiled.installed(), reason="numba is not installed")
+def test_stored_kernels_are_compiled_again_where_one_of_another_module_that_they_call_has_changed(
+    tmp_path: Path,
+) -> None:
+    head = "from lidarpose.geometry.compiled import kernel\n"
+    (tmp_path / "first_kernels.py").write_text(f"{head}@kernel\ndef factor():\n    return 2.0\n")
+    (tmp_path / "second_kernels.py").write_text(
+        f"{head}from first_kernels import factor\n@kernel\ndef times(x):\n    return factor() * x\n"
+    )
+    code = "from second_kernels import times\nprint(times(3.0), sum(times.stats.cache_hits.values()))"
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "stored"), "PYTHONPATH": path}
+
+    def run() -> list[str]:
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+        return done.stdout.split()
+
+    assert run() == ["6.0", "0"]
+    assert run() == ["6.0", "1"]
+    (tmp_path / "first_kernels.py").write_text(f"{head}@kernel\ndef factor():\n    return 25.0\n")
+    assert run() == ["75.0", "0"]
+
+
 def test_a_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)

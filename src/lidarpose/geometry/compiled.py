@@ -126,7 +126,26 @@ def _compiled(function: Function, *, reorders: bool) -> Function:
         compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath=fast)(function)
     except RuntimeError:  # "cannot cache function: no locator available"
         compiled = njit(nogil=True, error_model="numpy", fastmath=fast)(function)
+    _stamp_with_callees(compiled, function)
     return cast(Function, compiled)
+
+
+def _stamp_with_callees(compiled: Any, function: Callable[..., Any]) -> None:
+    """Let stored code go out of date with the kernels of other modules as well.
+
+    It holds a copy of all that it calls, but numba asks only whether the function's own file has changed.
+    """
+    own = _stamped_file(compiled)
+    called = (each for each in function.__globals__.values() if hasattr(each, "py_func"))
+    files = (_stamped_file(each) for each in called if each.py_func.__module__ != function.__module__)
+    stamps = sorted({str(file._source_stamp) for file in files if file is not None})
+    if own is not None and stamps:
+        own._source_stamp = (own._source_stamp, *stamps)
+
+
+def _stamped_file(compiled: Any) -> Any:
+    """Where numba keeps what a kernel was compiled from; None where nothing is stored."""
+    return getattr(compiled._cache, "_cache_file", None)
 
 
 def _importable() -> bool:
