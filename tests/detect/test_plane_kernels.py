@@ -13,6 +13,7 @@ from lidarpose.geometry import compiled
 from lidarpose.geometry.arrays import FloatArray, angle_between, perpendicular_pair
 from lidarpose.geometry.planes import Plane
 from lidarpose.model.plane_patch import PlanePatch
+from lidarpose.simulate.corner_scene import CornerSceneSpec, simulate_corner_session
 
 pytestmark = pytest.mark.skipif(not compiled.installed(), reason="numba is not installed")
 
@@ -51,6 +52,15 @@ def test_patches_of_a_cloud_that_is_searched_whole_are_the_same() -> None:
     """And those that come up once the large ones are gone, from several subsamples, down to the clutter's."""
     points, _ = scene(20_000, 0.02, 1)
     assert_the_same(both_ways(points, PlaneSearch(from_sensor=True)))
+
+
+def test_patches_of_a_lidars_frames_have_the_same_points() -> None:
+    """To the last one, as both ways round distances alike: a sighting hangs on its patches' outermost points."""
+    session, _ = simulate_corner_session(CornerSceneSpec(frames=1, places=3, room=True, clutter=4, seed=7))
+    for place in session.places:
+        plain, quick = both_ways(place.clouds[0].load().points, PlaneSearch(from_sensor=True))
+        assert len(plain) > 4
+        assert [p.indices.tolist() for p in plain] == [q.indices.tolist() for q in quick]
 
 
 @pytest.mark.parametrize("n", [13, 64, 65, 1500])

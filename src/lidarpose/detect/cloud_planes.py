@@ -24,6 +24,7 @@ from lidarpose.detect.patch_evidence import (
     WIDEST,
     Float32Array,
     first_in_each,
+    heights,
     is_thin,
     moments,
     moments_compiled,
@@ -306,8 +307,8 @@ def _best_patch(
         if np.count_nonzero(component) < 6:
             break
         plane = _moment_plane(sample.points[component])
-        distance = np.abs(sample.points @ plane.normal.astype(np.float32) - np.float32(plane.offset))
-        inside = (distance < GATE_SIGMAS * sample.sigma_m) & active
+        distance = np.abs(heights(sample.points, plane.normal, plane.offset))
+        inside = (distance < np.float32(GATE_SIGMAS * sample.sigma_m)) & active
         before, component = component, largest_component(sample.points, inside, plane)
         if np.array_equal(before, component):
             break
@@ -317,8 +318,8 @@ def _best_patch(
 def _moment_plane(points: NDArray[np.floating]) -> Plane:
     """Total least squares plane; the normal points to the origin's side."""
     mean = points.mean(axis=0, dtype=np.float64)
-    d = points - mean.astype(points.dtype)
-    normal = np.linalg.eigh((d.T @ d).astype(np.float64))[1][:, 0]
+    d = points - mean
+    normal = np.linalg.eigh(d.T @ d)[1][:, 0]
     offset = float(normal @ mean)
     return Plane(normal, offset) if offset <= 0.0 else Plane(-normal, -offset)
 
@@ -377,7 +378,7 @@ def _refit(
     sigma_m, normal, offset = sample.sigma_m, plane.normal, plane.offset - float(plane.normal @ centre)
     moments_of = moments_compiled if pays(0.0, KERNELS) else moments
     for _ in range(3):
-        distance = local @ normal.astype(np.float32) - np.float32(offset)
+        distance = heights(local, normal, offset)
         inside = np.abs(distance) < np.float32(GATE_SIGMAS * sigma_m)
         if np.count_nonzero(inside) < 6:
             return None
@@ -405,15 +406,15 @@ def _points_near(
     centre: Float32Array,
 ) -> tuple[IntArray, Float32Array]:
     """Which free points (M,) of x (N, 3) lie within reach of the plane in allowed cells, and where, from the centre."""
-    normal, offset = plane.normal.astype(np.float32), np.float32(plane.offset)
     if pays(0.0, KERNELS):
         from lidarpose.detect.patch_kernels import points_near
 
+        normal, offset = plane.normal.astype(np.float32), np.float32(plane.offset)
         across = (raster.axes / raster.cell_m).astype(np.float32)
         cells = allowed[:-1].reshape(raster.shape)
         near, local = points_near(x, free, normal, offset, reach_m, across, raster.origin, cells, centre)
         return near, local
-    near = np.flatnonzero((np.abs(x @ normal - offset) < reach_m) & free)
+    near = np.flatnonzero((np.abs(heights(x, plane.normal, plane.offset)) < reach_m) & free)
     local = x[near]
     keep = allowed[raster.cells(local)]
     return near[keep], local[keep] - centre

@@ -55,6 +55,17 @@ def local_planes_of(chosen: Float32Array) -> tuple[FloatArray, FloatArray]:
     return planes, np.maximum(values, 0.0)
 
 
+def heights(points: Float32Array, normal: FloatArray, offset: float) -> Float32Array:
+    """How far points (M, 3) are from a plane, in single precision, rounded as the kernels round it: a library's product
+    would leave points within rounding of a gate inside by the one way and outside by the other."""
+    a, b, c = normal.astype(np.float32)
+    height: Float32Array = points[:, 0] * a
+    height += points[:, 1] * b
+    height += points[:, 2] * c
+    height -= np.float32(offset)
+    return height
+
+
 def has_normal(variances: FloatArray, sigma_m: float) -> BoolArray:
     """Of neighbourhoods with variances (H, 3), which have a normal: wider than the noise, and not along a line."""
     return (variances[:, 1] > (SCREENING_WIDTH * sigma_m) ** 2) & (variances[:, 1] > LINED_UP * variances[:, 2])
@@ -77,7 +88,7 @@ def stands_out(
     """
     points = local[:: max(len(local) // EVIDENCE_POINTS, 1)]
     points = points[first_in_each(points, GATE_SIGMAS * sigma_m)]
-    height = np.abs(points @ normal.astype(np.float32) - np.float32(offset))
+    height = np.abs(heights(points, normal, offset))
     inside = height < GATE_SIGMAS * sigma_m
     around = height < 2.0 * GATE_SIGMAS * sigma_m
     if np.count_nonzero(inside) < max(STANDS_OUT * np.count_nonzero(around), 4.0):
@@ -132,13 +143,10 @@ def first_in_each(points: NDArray[np.floating], side_m: float) -> IntArray:
 
 
 def moments(local: Float32Array, inside: BoolArray) -> tuple[FloatArray, float, FloatArray]:
-    """Normal, offset and variances (3,), ascending, of the points (M, 3) that are inside; near the origin, so that
-    single precision holds their moments."""
-    weight = inside.astype(np.float32)
-    count = float(np.count_nonzero(inside))
-    mean = (weight @ local).astype(np.float64) / count
-    second = ((local * weight[:, None]).T @ local).astype(np.float64) / count - np.outer(mean, mean)
-    variances, axes = np.linalg.eigh(second)
+    """Normal, offset and variances (3,), ascending, of the points (M, 3) that are inside."""
+    chosen = local.compress(inside, axis=0).astype(np.float64)
+    mean = np.ones(len(chosen)) @ chosen / len(chosen)
+    variances, axes = np.linalg.eigh(chosen.T @ chosen / len(chosen) - np.outer(mean, mean))
     return axes[:, 0], float(axes[:, 0] @ mean), variances
 
 

@@ -40,7 +40,13 @@ class PlaneRaster:
 
 def _along(points: NDArray[np.floating], axes: FloatArray, cell_m: float) -> IntArray:
     """Coordinates (2, M) of points (M, 3) in whole cells."""
-    along = (axes / cell_m).astype(points.dtype) @ points.T
+    rows = (axes / cell_m).astype(points.dtype)
+    along = np.empty((2, len(points)), dtype=points.dtype)
+    # Rounded as the kernels round it, which a library's product is not.
+    for k, (a, b, c) in enumerate(rows):
+        along[k] = points[:, 0] * a
+        along[k] += points[:, 1] * b
+        along[k] += points[:, 2] * c
     return np.asarray(np.floor(along, out=along).astype(np.int64))
 
 

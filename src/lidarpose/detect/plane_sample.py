@@ -130,7 +130,10 @@ def _near(points: Float32Array, planes: FloatArray, gate_m: float) -> Bits:
     together = max(DISTANCES_AT_ONCE // max(len(points), 1), 1)
     for first in range(0, len(planes), together):
         some = rows[first : first + together]
-        distance = some[:, :3] @ columns
+        # Rounded as the kernels round it, which a library's product is not.
+        distance = some[:, :1] * columns[0]
+        distance += some[:, 1:2] * columns[1]
+        distance += some[:, 2:3] * columns[2]
         distance -= some[:, 3:]
         np.abs(distance, out=distance)
         near[first : first + together] = _bits(distance < np.float32(gate_m))
