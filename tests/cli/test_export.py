@@ -59,3 +59,19 @@ def test_wrong_usage_writes_nothing(
     assert run(["export", str(calibration), *arguments, "-o", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err.startswith("lidarpose: ")
     assert not (tmp_path / "out").exists()
+
+
+def test_the_calibration_itself_is_never_replaced(calibration: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = calibration.read_bytes()
+    same = calibration.parent / "." / calibration.name
+    assert run(["export", str(calibration), "--to", "urdf", "-o", str(same)]) == 2
+    assert "is read by this command" in capsys.readouterr().err
+    assert calibration.read_bytes() == before
+
+
+def test_an_angle_without_effect_is_said(calibration: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = calibration.with_name("robot.urdf")
+    assert run(["export", str(calibration), "--to", "urdf", "-o", str(out), "--angle-deg", "10"]) == 0
+    told = capsys.readouterr()
+    assert told.out == f"written: {out}\n"
+    assert "--angle-deg changes nothing" in told.err

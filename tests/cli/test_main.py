@@ -46,6 +46,16 @@ def test_wrong_usage_is_status_2_and_one_dry_message(arguments: list[str], capsy
     assert "Traceback" not in message.err
 
 
+def test_the_hint_is_for_the_command_that_was_given(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, hint in (
+        (["pose"], "pose"),
+        (["measure", "disk"], "measure disk"),
+        (["measure", "ball"], "measure"),
+    ):
+        assert run(arguments) == 2
+        assert capsys.readouterr().err.splitlines()[-1] == f"See: lidarpose {hint} --help"
+
+
 def test_pose_prints_one_json_object(calibration_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["pose", str(calibration_file), "--angle-deg", "-12.5", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

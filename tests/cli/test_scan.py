@@ -103,6 +103,29 @@ def test_gates_ranges_and_refuses_nonsense(folder: Path, capsys: pytest.CaptureF
         assert "Traceback" not in capsys.readouterr().err
 
 
+def test_a_gate_in_millimetres_writes_no_empty_cloud(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["scan", str(folder / "rec"), str(folder / "cal.json"), "-o", str(folder / "cloud.ply")]
+    assert run([*command, "--nearest-m", "1500"]) == 2
+    assert "between 1500 and inf m" in capsys.readouterr().err
+    np.save(folder / "rec" / "range_m.npy", np.full((6, 9), np.nan, dtype=np.float32))
+    assert run(command) == 1
+    assert not (folder / "cloud.ply").exists()
+
+
+@pytest.mark.parametrize("name", ["rec/range_m.npy", "rec/../rec/time_s.npy"])
+def test_no_file_that_is_read_is_replaced(folder: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (folder / name).read_bytes()
+    assert run(["scan", str(folder / "rec"), str(folder / "cal.json"), "-o", str(folder / name)]) == 2
+    assert "is read by this command" in capsys.readouterr().err
+    assert (folder / name).read_bytes() == before
+
+
+def test_a_session_is_no_recording(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "session.toml").write_text("")
+    assert run(["scan", str(folder), str(folder / "cal.json"), "-o", str(folder / "cloud.ply")]) == 2
+    assert "is a session; expected the folder of a sweep recording" in capsys.readouterr().err
+
+
 def test_an_unwritable_or_unknown_output_leaves_nothing(folder: Path) -> None:
     before = sorted(folder.iterdir())
     assert run(["scan", str(folder / "rec"), str(folder / "cal.json"), "-o", str(folder / "cloud.stl")]) == 2

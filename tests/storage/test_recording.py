@@ -146,5 +146,5 @@ def test_refuses_damage(recording: SweepRecording, tmp_path: Path, damage: objec
 
 
 def test_refuses_a_missing_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such folder"):
+    with pytest.raises(InputError, match="is missing"):
         read_recording(tmp_path / "none")

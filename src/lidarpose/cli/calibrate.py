@@ -100,11 +100,12 @@ def calibrate(
     report
         Write report.html too.
     """
-    from lidarpose.storage.atomic import require_writable_folder
+    from lidarpose.storage.atomic import require_apart, require_writable_folder
     from lidarpose.storage.recording_head import is_recording
     from lidarpose.storage.session import CORNER_SESSION_FORMAT, session_format
 
     require_writable_folder(output)
+    require_apart(output / "calibration.json", turntable, start)
     common: dict[str, Any] = {"want_mm": want_mm, "want_deg": want_deg, "report": report, "json": json, "quiet": quiet}
     of_turntables = {
         "--first-panel": first_panel is not None,

@@ -26,17 +26,17 @@ class Advance(Protocol):
 
 
 def out() -> Console:
-    """Standard output for people: colour on a terminal, plain text elsewhere."""
+    """Standard output for people: colour on a terminal, plain text in whole lines elsewhere."""
     from rich.console import Console
 
-    return Console(highlight=False)
+    return Console(highlight=False, soft_wrap=not sys.stdout.isatty())
 
 
 def err() -> Console:
     """Standard error, for progress and remarks."""
     from rich.console import Console
 
-    return Console(stderr=True, highlight=False)
+    return Console(stderr=True, highlight=False, soft_wrap=not sys.stderr.isatty())
 
 
 def print_json(value: Mapping[str, Any]) -> None:

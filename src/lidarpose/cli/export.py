@@ -50,12 +50,15 @@ def export(
     """
     import math
 
+    from lidarpose.cli.console import err, out
     from lidarpose.errors import InputError
     from lidarpose.model.calibration import TurntableCalibration
+    from lidarpose.storage.atomic import require_apart
     from lidarpose.storage.calibration import read_calibration
     from lidarpose.storage.camera_files import read_camera
     from lidarpose.storage.exports import ExportOptions, FrameNames, write_export
 
+    require_apart(output, calibration, camera)
     loaded = read_calibration(calibration)
     scale = loaded.motion.reading_scale if isinstance(loaded, TurntableCalibration) else 1.0
     one_pose = to == "ros2" and angle_deg is not None
@@ -73,9 +76,11 @@ def export(
         names=FrameNames(camera_frame, turntable_frame, lidar_frame, world_frame),
     )
     write_export(output, loaded, to, options)
+    out().print(f"written: {output}", markup=False)
+    if angle_deg is not None and (to == "urdf" or not isinstance(loaded, TurntableCalibration)):
+        what = "a URDF's joint takes any reading" if isinstance(loaded, TurntableCalibration) else "it has no turntable"
+        err().print(f"Note: --angle-deg changes nothing here: {what}.", markup=False)
     if loaded.quality is not None and loaded.quality.verdict != "good":
-        from lidarpose.cli.console import err
-
         reasons = "; ".join(loaded.quality.reasons)
         text = f"Note: the verdict on this calibration is {loaded.quality.verdict}"
         err().print(f"{text}: {reasons}" if reasons else f"{text}.", markup=False, soft_wrap=True)

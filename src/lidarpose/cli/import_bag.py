@@ -33,7 +33,7 @@ def import_bag(
     dwell_tolerance_deg: PositiveFloat = 0.05,
     cloud_topic: str | None = None,
     place: str | None = None,
-    world_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat] | None = None,
+    world_m: Annotated[tuple[FiniteFloat, FiniteFloat, FiniteFloat] | None, Parameter(negative="")] = None,
     axis_beam_deg: FiniteFloat | None = None,
     half_turn: Annotated[bool, Parameter(negative=(), show_default=False)] = False,
     lidar_model: str | None = None,

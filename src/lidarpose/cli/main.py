@@ -96,7 +96,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
     try:
         build_app()(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
-        return _complain(_usage(error), hint="See: lidarpose --help", status=EXIT_WRONG_INPUT)
+        hint = f"See: {' '.join(('lidarpose', *(error.command_chain or ())))} --help"
+        return _complain(_usage(error), hint=hint, status=EXIT_WRONG_INPUT)
     except InputError as error:
         return _complain(str(error), status=EXIT_WRONG_INPUT)
     except LidarposeError as error:

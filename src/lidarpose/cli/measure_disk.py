@@ -43,11 +43,16 @@ def measure_disk(
     """
     from lidarpose.cli.console import print_json
     from lidarpose.cli.measure_input import measurement_view
+    from lidarpose.errors import InputError
     from lidarpose.report.disk_page import disk_page
-    from lidarpose.storage.atomic import write_text
+    from lidarpose.storage.atomic import require_apart, write_text
     from lidarpose.workflows.measured_views import round_view
     from lidarpose.workflows.measuring import measure_disk as measure
 
+    if report is not None:
+        if report.suffix.lower() not in (".html", ".htm"):
+            raise InputError(report, "is no name of a page", expected="a name that ends in .html")
+        require_apart(report, source)
     view = measurement_view(source, calibration, never_stops)
     found = measure(view, "hole" if hole else "disk")
     remarks = [*view.remarks, *_remarks(found[0])]

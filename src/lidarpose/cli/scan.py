@@ -60,12 +60,14 @@ def scan(
         The turntable turned on during the sweeps: interpolate its readings by time_s.npy.
     """
     from lidarpose.cli.console import out, print_json, progress
+    from lidarpose.storage.atomic import require_apart
     from lidarpose.storage.calibration import read_turntable_calibration, read_world_calibration
     from lidarpose.storage.clouds import open_cloud_writer
-    from lidarpose.storage.recording import read_recording, release_pages
+    from lidarpose.storage.recording import read_recording, recording_files, release_pages
     from lidarpose.workflows.scanning import POINTS_PER_PART, ScanOptions, assemble_scan
 
     _check_gate(nearest_m, farthest_m)
+    require_apart(output, calibration, world, *recording_files(recording))
     sweeps = read_recording(recording)
     turntable = read_turntable_calibration(calibration)
     world_calibration = None if world is None else read_world_calibration(world)
@@ -88,6 +90,7 @@ def scan(
             step = min(POINTS_PER_PART, sweeps.range_m.size - done)
             done += step
             advance(step)
+        _require_points(points, sweeps.range_m.size, nearest_m, farthest_m)
     frame = "camera" if world is None else "world"
     if json:
         print_json(
@@ -106,6 +109,22 @@ def _check_gate(nearest_m: float, farthest_m: float) -> None:
         raise InputError("--nearest-m", f"is {nearest_m:g}", expected="metres, not negative")
     if math.isnan(farthest_m) or farthest_m <= nearest_m:
         raise InputError("--farthest-m", f"is {farthest_m:g}", expected=f"metres beyond --nearest-m ({nearest_m:g})")
+
+
+def _require_points(points: int, beams: int, nearest_m: float, farthest_m: float) -> None:
+    """Refuse to write a cloud without points."""
+    from lidarpose.errors import InputError, UndeterminedError
+
+    if points > 0:
+        return
+    if nearest_m > 0.0 or math.isfinite(farthest_m):
+        raise InputError(
+            "--nearest-m, --farthest-m",
+            f"none of the {beams} beams has a return between {nearest_m:g} and {farthest_m:g} m",
+            expected="metres between which something stands (1500 mm are 1.5)",
+        )
+    remedy = "Record it again, with something within the LiDAR's reach."
+    raise UndeterminedError(f"None of the recording's {beams} beams has a return", remedy=remedy)
 
 
 def _remarks(sigma: bool, calibration: TurntableCalibration, recording: SweepRecording) -> list[str]:

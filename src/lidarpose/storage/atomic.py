@@ -93,6 +93,13 @@ def _folder_made_for(path: Path) -> Iterator[None]:
         raise
 
 
+def require_apart(output: Path, *inputs: Path | None) -> None:
+    """InputError where writing `output` would take the place of a file that the same command reads."""
+    place = Path(output).resolve()
+    if any(place == source.resolve() for source in inputs if source is not None):
+        raise InputError(output, "is read by this command, and would be replaced", expected="another file to write")
+
+
 def require_new_folder(path: Path) -> None:
     """InputError if something stands at `path` already, an empty folder excepted."""
     restore_folder(Path(path))

@@ -106,7 +106,8 @@ def read_calibration(path: Path) -> Calibration:
     from lidarpose.storage.calibration_schema import CalibrationFile
     from lidarpose.storage.schemas import parse
 
-    file = parse(path, CalibrationFile, check_format(path, read_json(path), CALIBRATION_FORMAT))
+    document = read_json(path, "a calibration.json, as `lidarpose calibrate` writes it")
+    file = parse(path, CalibrationFile, check_format(path, document, CALIBRATION_FORMAT))
     quality = None
     if file.quality is not None:
         figures = dict(file.quality.model_extra or {})
@@ -120,7 +121,8 @@ def read_turntable_calibration(path: Path) -> TurntableCalibration:
     """Read a calibration that must be a turntable's. Raises InputError as `read_calibration`, or for another kind."""
     calibration = read_calibration(path)
     if not isinstance(calibration, TurntableCalibration):
-        raise InputError(path, 'is "world"', field="kind", expected='"turntable"')
+        remedy = "A world calibration is one pose for good: its file holds it, and `lidarpose export` writes it."
+        raise InputError(path, 'is "world"', field="kind", expected='"turntable"', remedy=remedy)
     return calibration
 
 

@@ -25,7 +25,7 @@ def read_text(path: Path, what: str, limit: int = MAX_DOCUMENT_BYTES) -> str:
     """The text of a small UTF-8 file. Raises InputError if it is missing, larger than `limit` bytes, or not text."""
     try:
         if not path.is_file():
-            problem = "is missing" if not path.exists() else "is not a regular file"
+            problem = "is a folder" if path.is_dir() else "is not a regular file" if path.exists() else "is missing"
             raise InputError(path, problem, expected=what)
         if path.stat().st_size > limit:
             raise InputError(path, f"is larger than {limit // 2**10} kB", expected=what)
@@ -131,7 +131,7 @@ def _plain_value(word: str) -> int | float | str:
     return word.strip('"')
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, what: str = "a JSON file") -> Any:
     """A JSON document without NaN or infinity, which JSON does not have, and without equal keys."""
 
     def refuse_constant(name: str) -> NoReturn:
@@ -144,11 +144,13 @@ def read_json(path: Path) -> Any:
             raise ValueError(f"the key {twin!r} stands twice")
         return dict(pairs)
 
-    text = read_text(path, "a JSON file")
+    text = read_text(path, what)
+    if not text.strip():
+        raise InputError(path, "is empty", expected=what)
     try:
         return json.loads(text, parse_constant=refuse_constant, object_pairs_hook=refuse_twins)
     except (ValueError, RecursionError) as error:
-        raise InputError(path, f"is not valid JSON: {error}") from error
+        raise InputError(path, f"is not valid JSON: {error}", expected=what) from error
 
 
 def check_format(path: Path, document: Any, expected: str) -> dict[str, Any]:

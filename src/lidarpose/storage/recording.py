@@ -58,7 +58,10 @@ def read_recording(folder: Path) -> SweepRecording:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(folder, "no such folder", expected="the folder of a sweep recording")
+        problem = "is not a folder" if folder.exists() else "is missing"
+        raise InputError(folder, problem, expected="the folder of a sweep recording")
+    if not (folder / HEAD).exists() and (folder / "session.toml").is_file():
+        raise InputError(folder, "is a session", expected=f"the folder of a sweep recording, with {HEAD}")
     lidar = _read_head(folder / HEAD)
     arrays: dict[str, RealArray | None] = {
         name: _map_array(folder / f"{name}.npy", required=name not in ("intensity", "time_s")) for name in _ARRAYS

@@ -154,6 +154,6 @@ def looks_like_millimetres(cloud: Cloud) -> bool:
 def _format(path: Path) -> str:
     name = _FORMATS.get(path.suffix.lower())
     if name is None:
-        found = path.suffix or "no suffix"
-        raise InputError(path, f"{found} names no cloud format", expected="one of " + " ".join(CLOUD_SUFFIXES))
+        problem = f"the suffix {path.suffix} names no cloud format" if path.suffix else "has no suffix"
+        raise InputError(path, problem, expected="one of " + " ".join(CLOUD_SUFFIXES))
     return f"lidarpose.storage.clouds.{name}"
