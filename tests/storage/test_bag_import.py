@@ -179,11 +179,60 @@ def test_scans_with_changing_beams_keep_their_angles(tmp_path: Path) -> None:
 def test_the_strongest_echo_and_no_range_that_the_sensor_calls_invalid(tmp_path: Path) -> None:
     make = bags.messages("sqlite3")
     entries = [("/j", START + 0.01 * k, make.joint(START + 0.01 * k, 0.5)) for k in range(100)]
-    echoes = [[1.0, 2.0], [3.0], [], [0.05], [np.inf]]
-    strengths = [[5.0, 9.0], [1.0], [], [1.0], [1.0]]
+    echoes = [[1.0, 2.0], [3.0], [], [0.05], [np.inf], [np.inf, 4.0], [5.0, np.nan], [6.0, 40.0]]
+    strengths = [[5.0, 9.0], [1.0], [], [1.0], [1.0], [9.0, 1.0], [1.0, np.nan], [1.0, 9.0]]
     entries.append(("/multi", START + 0.5, make.multi_echo(START + 0.5, echoes, strengths)))
     recording = make_recording(tmp_path, "sqlite3", entries)
-    np.testing.assert_array_equal(recording.range_m, np.array([[2.0, 3.0, np.nan, np.nan, np.nan]], dtype=np.float32))
+    wanted = [[2.0, 3.0, np.nan, np.nan, np.nan, 4.0, 5.0, 6.0]]
+    np.testing.assert_array_equal(recording.range_m, np.array(wanted, dtype=np.float32))
+
+
+def scans_with(**values: Any) -> list[Any]:
+    """Scans of 271 beams 0.01 rad apart while the table turns by 0.1 rad a second, for 1.2 s."""
+    make = bags.messages("mcap")
+    entries = [("/j", START + t, make.joint(START + t, 0.1 * t)) for t in np.arange(-0.1, 1.4, 0.01)]
+    ranges = values.pop("ranges", np.full(271, 2.0))
+    return entries + [("/s", START + t, make.scan(START + t, ranges, **values)) for t in np.arange(12) * 0.1]
+
+
+@pytest.mark.parametrize("scan_time", [0.1, 0.0])
+def test_a_fan_is_seen_in_its_share_of_the_mirror_s_turn(tmp_path: Path, scan_time: float) -> None:
+    recording = make_recording(tmp_path, "mcap", scans_with(time_increment=0.0, scan_time=scan_time))
+    turned = np.ptp(np.radians(recording.turntable_angle_deg), axis=1)
+    np.testing.assert_allclose(turned[:-1], 0.1 * 0.1 * 2.7 / (2.0 * np.pi), rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("angles", "told"),
+    [
+        ({"angle_min": 1.0, "angle_increment": -0.01, "angle_max": -1.7}, False),
+        ({"angle_max": -1.0 + 0.01 * 271}, False),
+        ({"angle_min": -np.pi, "angle_increment": 2.0 * np.pi / 271, "angle_max": -np.pi}, False),
+        ({"angle_min": 1.0, "angle_max": -1.7}, True),
+        ({"angle_max": -1.0 + 0.02 * 270}, True),
+    ],
+)
+def test_beams_go_by_their_steps_and_a_contradicting_end_is_told(
+    tmp_path: Path, angles: dict[str, float], told: bool
+) -> None:
+    report = import_bag(bags.write_bag(tmp_path, "mcap", scans_with(**angles)), tmp_path / "out")
+    assert any("angle_max" in remark for remark in report.remarks) == told
+    wanted = angles.get("angle_min", -1.0) + angles.get("angle_increment", 0.01) * np.arange(271)
+    np.testing.assert_allclose(read_recording(tmp_path / "out").beam_angle_rad, wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"angle_min": -135.0, "angle_max": 135.0, "angle_increment": 1.0}, "radians"),
+        ({"ranges": np.full(271, 2000.0)}, "range_min and range_max"),
+        ({"ranges": np.full(271, 5000.0), "range_max": 30000.0}, "millimetres"),
+    ],
+)
+def test_scans_in_other_units_are_refused(tmp_path: Path, values: dict[str, Any], message: str) -> None:
+    bag = bags.write_bag(tmp_path, "mcap", scans_with(**values))
+    with pytest.raises(InputError, match=message):
+        import_bag(bag, tmp_path / "out")
 
 
 def test_topics_are_named_where_there_are_several(tmp_path: Path) -> None:

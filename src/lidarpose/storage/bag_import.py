@@ -23,6 +23,7 @@ from lidarpose.storage import rosbag
 from lidarpose.storage.atomic import require_new_folder
 from lidarpose.storage.bag_messages import (
     ScanMessage,
+    beam_share,
     camera_of,
     grey_image,
     joint_position,
@@ -202,13 +203,29 @@ def _read(bag: Bag, options: ImportOptions, image_topics: tuple[str, ...]) -> _R
     for topic in (scan_topic, angle_topic, *image_topics):
         if topic not in times:
             raise InputError(bag.path, "has no message that could be used", field=topic)
+    if not any(np.isfinite(scan.ranges).any() for scan in scans):
+        problem = "has no range between range_min and range_max"
+        raise InputError(bag.path, problem, field=scan_topic, expected="ranges in metres, as their limits are")
     remarks = [f"{counts['empty']} scans without beams were left out."] if counts["empty"] else []
+    remarks += _about_angles(scan_topic, scans)
     angle_deg = _degrees(bag, angle_topic, np.array(readings), options, remarks)
     streams = {topic: Stream.of(*entry) for topic, entry in times.items()}
     seconds, clock_remarks = common_times(str(bag.path), streams, set(image_topics))
     images = [replace(image, time_s=float(seconds[image.source.topic][image.index])) for image in images]
     remarks += clock_remarks
     return _Recorded(bag, scans, seconds[scan_topic], seconds[angle_topic], angle_deg, images, remarks)
+
+
+def _about_angles(topic: str, scans: list[ScanMessage]) -> list[str]:
+    odd = next((scan for scan in scans if scan.contradicts_itself), None)
+    if odd is None:
+        return []
+    first, last, step = (float(np.degrees(a)) for a in (odd.angle_min, odd.angle_max, odd.angle_increment))
+    end = first + step * (len(odd.ranges) - 1)
+    return [
+        f"{topic}: {len(odd.ranges)} beams from {first:.2f} deg in steps of {step:.4f} deg end at {end:.2f} deg, but "
+        f"angle_max says {last:.2f}. The steps are taken: see that the scan is neither stretched nor mirrored."
+    ]
 
 
 def _reading(bag: Bag, topic: str, message: Any, joint: str | None) -> float | None:
@@ -314,8 +331,8 @@ def _usual_beam_dt(scans: list[ScanMessage], scan_times: FloatArray, remarks: li
         return 0.0
     if len(scans) < 2:
         return 0.0
-    beams = float(np.median([len(scan.ranges) for scan in scans]))
-    dt = float(np.median(np.diff(scan_times))) / beams
+    share = float(np.median([beam_share(scan.angle_increment, len(scan.ranges)) for scan in scans]))
+    dt = float(np.median(np.diff(scan_times))) * share
     remarks.append(
         f"Scans do not say how fast they are: {1e6 * dt:.1f} us from beam to beam, by the time between scans."
     )

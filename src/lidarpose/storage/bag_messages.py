@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarpose.errors import InputError
-from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.model.camera import COEFFICIENT_COUNTS, Camera
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.image import GrayImage
@@ -20,6 +21,8 @@ from lidarpose.storage.images import decode_image
 
 _MAX_BEAMS = 1 << 20
 _MAX_PIXELS = 1 << 28
+# Two turns: more are degrees.
+_MAX_SPAN_RAD = 4.0 * math.pi
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _GREY = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
 _COLOUR = {"rgb8": (0, 3), "bgr8": (2, 3), "8UC3": (2, 3), "rgba8": (0, 4), "bgra8": (2, 4), "8UC4": (2, 4)}
@@ -34,6 +37,8 @@ class ScanMessage:
     ----------
     received_ns, stamp_ns
         By the recorder's clock, and by the sensor's (None where the stamp is 0).
+    angle_max
+        Where beams end by the message; they are taken in steps of `angle_increment` from `angle_min`.
     beam_dt_s
         Seconds from beam to beam; None where the message does not say.
     """
@@ -41,6 +46,7 @@ class ScanMessage:
     received_ns: int
     stamp_ns: int | None
     angle_min: float
+    angle_max: float
     angle_increment: float
     beam_dt_s: float | None
     ranges: NDArray[np.float32]
@@ -50,6 +56,12 @@ class ScanMessage:
     def geometry(self) -> tuple[float, float, int]:
         """What two scans must share to have the same beams."""
         return self.angle_min, self.angle_increment, len(self.ranges)
+
+    @property
+    def contradicts_itself(self) -> bool:
+        """Whether the beams end by more than one step elsewhere than the message says, whole turns aside."""
+        beyond = self.angle_max - self.angle_min - self.angle_increment * (len(self.ranges) - 1)
+        return abs(math.remainder(beyond, 2.0 * math.pi)) > 1.5 * abs(self.angle_increment)
 
     def beam_angle_rad(self) -> FloatArray:
         """(N,)"""
@@ -66,45 +78,65 @@ def stamp_ns(message: Any) -> int | None:
 
 
 def scan_message(bag: Path, topic: str, received_ns: int, message: Any) -> ScanMessage:
-    """A LaserScan, or of a MultiEchoLaserScan the strongest echo of each beam (without intensities the first)."""
+    """A LaserScan, or of a MultiEchoLaserScan the strongest return of each beam (without intensities the first)."""
+    low, high = float(message.range_min), float(message.range_max)
     if hasattr(message.ranges, "dtype"):
         ranges = np.array(message.ranges, dtype=np.float32)
         intensities = np.array(message.intensities, dtype=np.float32)
+        ranges[_invalid(ranges, low, high)] = np.nan
     else:
-        ranges, intensities = _strongest_echoes(message)
-    angle_min, increment = float(message.angle_min), float(message.angle_increment)
+        ranges, intensities = _strongest_echoes(message, low, high)
+    angle_min, angle_max = float(message.angle_min), float(message.angle_max)
+    increment = float(message.angle_increment)
     if len(ranges) == 0:  # drivers send these while the LiDAR starts, with steps of infinity
-        angle_min = increment = 0.0
+        angle_min = angle_max = increment = 0.0
+    if not np.isfinite(angle_max):
+        angle_max = angle_min + increment * (len(ranges) - 1)
+    span = abs(increment) * (len(ranges) - 1)
     if len(ranges) > _MAX_BEAMS or not np.isfinite([angle_min, increment]).all() or (len(ranges) > 1 and not increment):
         problem = f"has a scan of {len(ranges)} beams from {angle_min} rad in steps of {increment} rad"
         raise InputError(bag, problem, field=topic, expected="beam angles that grow or fall")
-    low, high = float(message.range_min), float(message.range_max)
+    if span > _MAX_SPAN_RAD:
+        problem = f"has a scan of {len(ranges)} beams over {span:g} rad"
+        raise InputError(bag, problem, field=topic, expected="angles in radians", remedy="Let the driver convert them.")
+    kept = intensities if len(intensities) == len(ranges) and len(ranges) else None
+    dt = _beam_dt(message, beam_share(increment, len(ranges)))
+    return ScanMessage(received_ns, stamp_ns(message), angle_min, angle_max, increment, dt, ranges, kept)
+
+
+def _invalid(ranges: NDArray[np.float32], low: float, high: float) -> BoolArray:
+    """Those that are no return, or out of the range that the sensor states."""
     invalid = ~np.isfinite(ranges) | (ranges <= 0.0)
     if 0.0 <= low < high:
         invalid |= (ranges < low) | (ranges > high)
-    ranges[invalid] = np.nan
-    kept = intensities if len(intensities) == len(ranges) and len(ranges) else None
-    return ScanMessage(received_ns, stamp_ns(message), angle_min, increment, _beam_dt(message), ranges, kept)
+    return invalid
 
 
-def _beam_dt(message: Any) -> float | None:
+def beam_share(increment: float, beams: int) -> float:
+    """Of the time of a scan, from beam to beam: the mirror turns once, also while it looks where no beams are."""
+    return min(abs(increment) / (2.0 * math.pi), 1.0 / max(beams, 1))
+
+
+def _beam_dt(message: Any, share: float) -> float | None:
     """From the time between beams, or from the scan's where that is left 0, as some drivers do."""
-    step, whole, beams = float(message.time_increment), float(message.scan_time), len(message.ranges)
+    step, whole = float(message.time_increment), float(message.scan_time)
     if np.isfinite(step) and step > 0.0:
         return step
-    return whole / beams if np.isfinite(whole) and whole > 0.0 and beams else None
+    return whole * share if np.isfinite(whole) and whole > 0.0 and share else None
 
 
-def _strongest_echoes(message: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _strongest_echoes(message: Any, low: float, high: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Of each beam the strongest echo that is a return."""
     echoes = [np.asarray(echo.echoes, dtype=np.float32) for echo in message.ranges]
     strengths = [np.asarray(echo.echoes, dtype=np.float32) for echo in message.intensities]
     ranges = np.full(len(echoes), np.nan, dtype=np.float32)
     known = len(strengths) == len(echoes) and all(len(a) == len(b) for a, b in zip(echoes, strengths, strict=True))
     intensities = np.full(len(echoes) if known else 0, np.nan, dtype=np.float32)
     for k, values in enumerate(echoes):
-        if len(values) == 0:
+        seen = np.flatnonzero(~_invalid(values, low, high))
+        if len(seen) == 0:
             continue
-        best = int(np.argmax(strengths[k])) if known else 0
+        best = int(seen[np.argmax(np.nan_to_num(strengths[k][seen], nan=-np.inf))]) if known else int(seen[0])
         ranges[k] = values[best]
         if known:
             intensities[k] = strengths[k][best]

@@ -81,9 +81,10 @@ def write_recording(folder: Path, recording: SweepRecording) -> None:
     Raises
     ------
     InputError
-        If the folder holds anything but a recording, or cannot be written to.
+        If the folder holds anything but a recording, or cannot be written to, or the ranges are millimetres.
     """
     folder = Path(folder)
+    _check_ranges(folder, np.asarray(recording.range_m))
     restore_folder(folder)
     _check_replaceable(folder)
     arrays: dict[str, Any] = {
