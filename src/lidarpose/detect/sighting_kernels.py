@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.detect.patch_kernels import eigen, pair_across
+from lidarpose.detect.patch_kernels import eigen, mean_and_products, pair_across
 from lidarpose.detect.target_kernels import faces_met, points_in_box
 from lidarpose.geometry.compiled import kernel
 
@@ -60,41 +60,26 @@ def _mode(values: Any, width: float) -> Any:
 def _fitted(points: Any, chosen: Any, plane: Any, gate: float, steps: int, fewest: int) -> Any:
     """Fit a plane, normal and offset (4,), to those of the chosen points that are near it, in place; whether it is
     one."""
-    sums, second = np.empty(3), np.empty((3, 3))
+    near = np.empty((len(chosen), 3))
     for _ in range(steps):
-        # About a point on the plane, where differences of squares lose no digits.
-        p, q, r = plane[0] * plane[3], plane[1] * plane[3], plane[2] * plane[3]
         count = 0
-        sums[:] = 0.0
-        second[:] = 0.0
         for i in chosen:
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
             if abs(plane[0] * x + plane[1] * y + plane[2] * z - plane[3]) < gate:
+                near[count, 0], near[count, 1], near[count, 2] = x, y, z
                 count += 1
-                x, y, z = x - p, y - q, z - r
-                sums[0] += x
-                sums[1] += y
-                sums[2] += z
-                second[0, 0] += x * x
-                second[0, 1] += x * y
-                second[0, 2] += x * z
-                second[1, 1] += y * y
-                second[1, 2] += y * z
-                second[2, 2] += z * z
         if count < fewest:
             return False
-        for i in range(3):
-            for j in range(i, 3):
-                second[i, j] = (second[i, j] - sums[i] * sums[j] / count) / (count - 1)
-                second[j, i] = second[i, j]
-        values, axes = eigen(second)
+        mean, products = mean_and_products(near[:count], count - 1.0)
+        values, axes = eigen(products)
         if values[1] < 4.0 * values[0]:
             return False
-        a, b, c = axes[0, 0], axes[1, 0], axes[2, 0]
-        if not a * plane[0] + b * plane[1] + c * plane[2] > 0.0:
-            a, b, c = -a, -b, -c
-        plane[0], plane[1], plane[2] = a, b, c
-        plane[3] = a * (p + sums[0] / count) + b * (q + sums[1] / count) + c * (r + sums[2] / count)
+        along = axes[0, 0] * plane[0] + axes[1, 0] * plane[1] + axes[2, 0] * plane[2]
+        offset = 0.0
+        for axis in range(3):
+            plane[axis] = axes[axis, 0] if along > 0.0 else -axes[axis, 0]
+            offset += plane[axis] * mean[axis]
+        plane[3] = offset
     return True
 
 

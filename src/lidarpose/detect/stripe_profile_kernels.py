@@ -152,6 +152,60 @@ def take_out(own: Any, cross: Any, u: Any, middle: Any, half: Any, bright: Any, 
 
 
 @kernel
+def _without_ambient(values: Any, bright: Any, band: int, share: Any, rest: Any) -> None:
+    """What is left of a band's pixels (P, N) without a share of the bright image and each profile's mean."""
+    pixels, profiles = rest.shape
+    mean, number = np.zeros(profiles, np.float32), np.float32(pixels)
+    for p in range(pixels):
+        for n in range(profiles):
+            rest[p, n] = values[p, band, n] - share * bright[p, band, n]
+            mean[n] += rest[p, n]
+    for n in range(profiles):
+        mean[n] /= number
+    for p in range(pixels):
+        for n in range(profiles):
+            rest[p, n] -= mean[n]
+
+
+@kernel
+def _brightest(rest: Any, peak: Any, top: Any) -> None:
+    """Where profiles (P, N) are highest, all pixels but the ends smoothed with their neighbours, and how high."""
+    pixels, profiles = rest.shape
+    quarter, half = np.float32(0.25), np.float32(0.5)
+    for n in range(profiles):
+        top[n], peak[n] = rest[0, n], 0
+    smooth = np.empty(profiles, np.float32)
+    for p in range(1, pixels):
+        if p < pixels - 1:
+            for n in range(profiles):
+                smooth[n] = quarter * rest[p - 1, n] + half * rest[p, n] + quarter * rest[p + 1, n]
+        else:
+            smooth[:] = rest[p]
+        for n in range(profiles):
+            if smooth[n] > top[n]:
+                top[n], peak[n] = smooth[n], p
+
+
+@kernel
+def _rough_width(rest: Any, peak: Any, top: Any, near: Any, x: Any, curve: Any, half: float, some: Any) -> float:
+    """A stripe's width from the light around the peaks of profiles that are `near` (N,) its curve."""
+    last, lowest, none = rest.shape[0] - 1, np.float32(1e-3), np.float32(0.0)
+    count = 0
+    for n in range(len(x)):
+        if near[n] > 0.0:
+            total = none
+            for k in range(-9, 10):
+                value = rest[min(max(peak[n] + k, 0), last), n]
+                total += value if value > none else none
+            slope = 2.0 * curve[2] / half * x[n] + curve[1] / half
+            total = total / (top[n] if top[n] > lowest else lowest)
+            some[count] = total * (1.0 / np.sqrt(1.0 + slope**2))
+            count += 1
+    width = 1.15 * _quantile(some, count, 0.5) / np.sqrt(2.0 * np.pi)
+    return float(min(max(width, 0.6), 6.0))
+
+
+@kernel
 def first_curves(
     values: Any, bright: Any, share: Any, v0: Any, u: Any, valid: Any, straight: Any, least: int, found: Any
 ) -> None:
@@ -160,51 +214,25 @@ def first_curves(
     `straight` (B, N) are the first curves' v, `share` and `v0` as the tables', single.
     """
     pixels, bands, profiles = values.shape
-    rest, smooth = np.empty((pixels, profiles), np.float32), np.empty((pixels, profiles), np.float32)
-    mean, top, area = (np.empty(profiles, np.float32), np.empty(profiles, np.float32), np.empty(profiles, np.float32))
+    rest = np.empty((pixels, profiles), np.float32)
+    top, height = np.empty(profiles, np.float32), np.empty(profiles, np.float32)
     peak, chosen = np.empty(profiles, np.int64), np.empty(profiles, np.bool_)
-    x, v, at, near, some = (
-        np.empty(profiles),
-        np.empty(profiles),
-        np.empty(profiles),
-        np.empty(profiles),
-        np.empty(profiles),
-    )
+    x, v, at = np.empty(profiles), np.empty(profiles), np.empty(profiles)
+    near, some = np.empty(profiles), np.empty(profiles)
     normal, curve = np.empty((4, 4)), np.empty(4)
-    quarter, half_, number = np.float32(0.25), np.float32(0.5), np.float32(pixels)
     for b in range(bands):
-        for n in range(profiles):
-            mean[n], peak[n] = np.float32(0.0), 0
-        for p in range(pixels):
-            for n in range(profiles):
-                rest[p, n] = values[p, b, n] - share[b] * bright[p, b, n]
-                mean[n] += rest[p, n]
-        for n in range(profiles):
-            mean[n] /= number
-        for p in range(pixels):
-            for n in range(profiles):
-                rest[p, n] -= mean[n]
-        for n in range(profiles):
-            smooth[0, n], smooth[pixels - 1, n] = rest[0, n], rest[pixels - 1, n]
-            top[n] = rest[0, n]
-        for p in range(1, pixels - 1):
-            for n in range(profiles):
-                smooth[p, n] = quarter * rest[p - 1, n] + half_ * rest[p, n] + quarter * rest[p + 1, n]
-        for p in range(1, pixels):
-            for n in range(profiles):
-                if smooth[p, n] > top[n]:
-                    top[n], peak[n] = smooth[p, n], p
+        _without_ambient(values, bright, b, share[b], rest)
+        _brightest(rest, peak, top)
         count = 0
         for n in range(profiles):
-            v[n] = np.float64(v0[b, n]) + peak[n]
             if valid[b, n]:
-                area[count] = top[n]
+                height[count] = top[n]
                 count += 1
-        threshold = 0.4 * _quantile(area, count, 0.75)
+        threshold = 0.4 * _quantile(height, count, 0.75)
         middle, half = _scale_of(u[b], valid[b])
         for n in range(profiles):
             chosen[n] = valid[b, n] and top[n] > threshold
-            x[n], at[n] = (u[b, n] - middle) / half, straight[b, n]
+            x[n], v[n], at[n] = (u[b, n] - middle) / half, np.float64(v0[b, n]) + peak[n], straight[b, n]
         is_ridge = True
         for reach in (8.0, 4.0, 2.5):
             count = 0
@@ -216,22 +244,10 @@ def first_curves(
             _fit_curve(x, v, near, 3, False, normal, curve)
             for n in range(profiles):
                 at[n] = _horner(curve, 3, x[n])
-        count = 0
-        for n in range(profiles):
-            if near[n] > 0.0:
-                total = np.float32(0.0)
-                for k in range(-9, 10):
-                    value = rest[min(max(peak[n] + k, 0), pixels - 1), n]
-                    total += value if value > np.float32(0.0) else np.float32(0.0)
-                slope = 2.0 * curve[2] / half * x[n] + curve[1] / half
-                lowest = np.float32(1e-3)
-                total = total / (top[n] if top[n] > lowest else lowest)
-                some[count] = total * (1.0 / np.sqrt(1.0 + slope**2))
-                count += 1
-        width = 1.15 * _quantile(some, count, 0.5) / np.sqrt(2.0 * np.pi)
         for k in range(3):
             found[b, k] = curve[k]
-        found[b, 3], found[b, 4], found[b, 5] = middle, half, min(max(width, 0.6), 6.0)
+        found[b, 3], found[b, 4] = middle, half
+        found[b, 5] = _rough_width(rest, peak, top, near, x, curve, half, some)
         found[b, 6] = 1.0 if is_ridge else 0.0
 
 
