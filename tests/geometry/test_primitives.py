@@ -8,21 +8,12 @@ from lidarpose.geometry.circles import fit_circle2, fit_circle3
 from lidarpose.geometry.lines import Line2, fit_line2
 from lidarpose.geometry.planes import Plane, fit_plane, intersect_three_planes
 from lidarpose.geometry.robust import box_plot_inliers, chi2_tail, mad_sigma, ransac
-from lidarpose.geometry.se3 import Pose
 
 
 def test_a_vertical_line_is_no_special_case() -> None:
     line = fit_line2([[2.0, -1.0], [2.0, 5.0], [2.0, 7.0]])
     np.testing.assert_allclose(np.abs(line.normal), [1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(line.intersection(Line2(np.array([0.0, 2.0]), 6.0)), [2.0, 3.0])
-
-
-def test_planes_move_with_their_frame() -> None:
-    rng = np.random.default_rng(1)
-    plane = Plane(unit(rng.normal(size=3)), 0.7)
-    T = Pose.exp(rng.normal(size=6))
-    on_plane = plane.project(rng.normal(size=(10, 3)))
-    np.testing.assert_allclose(plane.transformed(T).distance(T @ on_plane), 0.0, atol=1e-12)
 
 
 def test_three_planes_meet_where_they_were_made_to_and_parallels_are_refused() -> None:

@@ -422,7 +422,7 @@ def samples(
     most: int,
     found: Any,
 ) -> Any:
-    """As `stripe_noise.Samples.of` picks them: residual, level and signal (B, 3, M) of pixels, and how many each (B,)."""
+    """`stripe_noise.Samples.of`: residual, level and signal (B, 3, M) of pixels, and how many each (B,)."""
     profile_pixels, bands, profiles = values.shape
     zero, one = np.float32(0.0), np.float32(1.0)
     counts = np.zeros(bands, np.int64)

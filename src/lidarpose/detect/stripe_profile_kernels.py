@@ -413,6 +413,28 @@ def _stated_sigma(far: Any, sigma: Any, factors: Any, halvings: int, some: Any, 
 
 
 @kernel
+def _blocks(u: Any, valid: Any, kept: Any, residual: Any, cosine: Any, sine: Any, length: int, found: Any) -> int:
+    """Blocks of a band's neighbouring profiles: weighted means of u, residual, cosine and sine, and the mean's sigma,
+    as columns of `found` (5, N); how many blocks have enough of them."""
+    profiles = len(u)
+    m, n = 0, 0
+    while n < profiles and valid[n]:
+        block, seen = np.floor(u[n] / length), 0
+        w0, wu, wr, wc, ws = 0.0, 0.0, 0.0, 0.0, 0.0
+        while n < profiles and valid[n] and np.floor(u[n] / length) == block:
+            w = kept[n]
+            seen += w > 0.0
+            w0, wu, wr = w0 + w, wu + w * u[n], wr + w * residual[n]
+            wc, ws = wc + w * cosine[n], ws + w * sine[n]
+            n += 1
+        if seen >= length // 2 and w0 > 0.0:
+            found[0, m], found[1, m], found[2, m], found[3, m] = wu / w0, wr / w0, wc / w0, ws / w0
+            found[4, m] = 1.0 / np.sqrt(w0)
+            m += 1
+    return m
+
+
+@kernel
 def merge(
     u: Any,
     valid: Any,
@@ -448,20 +470,7 @@ def merge(
         for n in range(profiles):
             used += valid[b, n] and kept[b, n] != 0.0
         length = sizes[0] if used > sizes[1] else sizes[0] // 2
-        m, n = 0, 0
-        while n < profiles and valid[b, n]:
-            block, seen = np.floor(u[b, n] / length), 0
-            w0, wu, wr, wc, ws = 0.0, 0.0, 0.0, 0.0, 0.0
-            while n < profiles and valid[b, n] and np.floor(u[b, n] / length) == block:
-                w = kept[b, n]
-                seen += w > 0.0
-                w0, wu, wr = w0 + w, wu + w * u[b, n], wr + w * residual[b, n]
-                wc, ws = wc + w * cosine[b, n], ws + w * sine[b, n]
-                n += 1
-            if seen >= length // 2 and w0 > 0.0:
-                found[0, m], found[1, m], found[2, m], found[3, m] = wu / w0, wr / w0, wc / w0, ws / w0
-                found[4, m] = 1.0 / np.sqrt(w0)
-                m += 1
+        m = _blocks(u[b], valid[b], kept[b], residual[b], cosine[b], sine[b], length, found)
         if m < sizes[2]:
             problems[b] = TOO_FEW
             continue

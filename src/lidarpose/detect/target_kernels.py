@@ -14,11 +14,9 @@ import numpy as np
 from lidarpose.geometry.compiled import kernel
 
 # Points are asked so many at a time: most hold none that is wanted.
-_BLOCK = 256
-
-
+_POINTS = 256
 # Beams that are asked together.
-BLOCK = 512
+_BEAMS = 512
 
 
 @kernel
@@ -42,13 +40,13 @@ def points_in_box(flat: Any, step: int, count: int, middle: Any, half: Any) -> A
 
     The points stand in `flat`, so many numbers apart, three and more, x, y and z of each side by side.
     """
-    room = 4 * _BLOCK
+    room = 4 * _POINTS
     inside = np.empty(3 * room, flat.dtype)
-    block = np.empty(3 * _BLOCK, flat.dtype)
-    flags, index = np.empty(_BLOCK, np.int32), np.empty(_BLOCK + 1, np.uint32)
+    block = np.empty(3 * _POINTS, flat.dtype)
+    flags, index = np.empty(_POINTS, np.int32), np.empty(_POINTS + 1, np.uint32)
     kept = 0
-    for first in range(0, count, _BLOCK):
-        few = min(_BLOCK, count - first)
+    for first in range(0, count, _POINTS):
+        few = min(_POINTS, count - first)
         some, start = flat, 3 * first
         if step != 3:
             for k in range(few):
@@ -237,11 +235,11 @@ def faces_met(
     x, y, z = rays[0], rays[1], rays[2]
     found = np.full(len(range_m), -1, np.int8)
     # Everything is asked of many beams at a time, which vector instructions do together.
-    first, reach = np.empty(BLOCK, np.int64), np.empty(BLOCK)
-    point, who = np.empty((3, 3, BLOCK)), np.empty((3, BLOCK), np.int64)
+    first, reach = np.empty(_BEAMS, np.int64), np.empty(_BEAMS)
+    point, who = np.empty((3, 3, _BEAMS)), np.empty((3, _BEAMS), np.int64)
     many = np.zeros(3, np.int64)
-    for begin in range(0, len(range_m), BLOCK):
-        size = min(BLOCK, len(range_m) - begin)
+    for begin in range(0, len(range_m), _BEAMS):
+        size = min(_BEAMS, len(range_m) - begin)
         first_met(x[begin:], y[begin:], z[begin:], normals, heights, convex, size, first, reach)
         many[:] = 0
         for k in range(size):
@@ -358,14 +356,14 @@ def beams_of_faces(
     Which points (M,), how many of each face (3,), their rays (3 M,), three rows for each face, their ranges (M,), and
     which (M,) lie outside the outlines.
     """
-    beams = np.empty((4, BLOCK))
-    first, reach, good = np.empty(BLOCK, np.int64), np.empty(BLOCK), np.empty(BLOCK, np.int64)
-    point, who = np.empty((3, 3, BLOCK)), np.empty((3, BLOCK), np.int64)
+    beams = np.empty((4, _BEAMS))
+    first, reach, good = np.empty(_BEAMS, np.int64), np.empty(_BEAMS), np.empty(_BEAMS, np.int64)
+    point, who = np.empty((3, 3, _BEAMS)), np.empty((3, _BEAMS), np.int64)
     many, total = np.zeros(3, np.int64), np.zeros(3, np.int64)
     of_face, which = np.empty((3, 4, len(points))), np.empty((3, len(points)), np.int64)
     on_rim = np.empty((3, len(points)), np.bool_)
-    for begin in range(0, len(points), BLOCK):
-        size = min(BLOCK, len(points) - begin)
+    for begin in range(0, len(points), _BEAMS):
+        size = min(_BEAMS, len(points) - begin)
         for k in range(size):
             x, y, z = points[begin + k, 0], points[begin + k, 1], points[begin + k, 2]
             far = np.sqrt(x * x + y * y + z * z)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -79,8 +78,3 @@ def perpendicular_pair(direction: ArrayLike) -> tuple[FloatArray, FloatArray]:
     across = math.sqrt(p * p + q * q + r * r)
     p, q, r = p / across, q / across, r / across
     return np.array([p, q, r]), np.array([y * r - z * q, z * p - x * r, x * q - y * p])
-
-
-def all_finite(arrays: Iterable[ArrayLike]) -> bool:
-    """True if no array holds NaN or infinity."""
-    return all(bool(np.all(np.isfinite(np.asarray(a)))) for a in arrays)

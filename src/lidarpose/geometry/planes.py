@@ -44,11 +44,6 @@ class Plane:
     def flipped(self) -> Plane:
         return Plane(-self.normal, -self.offset)
 
-    def transformed(self, T_b_a: Pose) -> Plane:
-        """The same plane, given in frame a, in frame b."""
-        normal = T_b_a.rotation @ self.normal
-        return Plane(normal, self.offset + float(normal @ T_b_a.translation))
-
     def intersect_rays(self, directions: ArrayLike, origin: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
         """Points (..., 3) where rays from `origin` along `directions` (..., 3) meet the plane; inf where parallel."""
         d = np.asarray(directions, dtype=np.float64)

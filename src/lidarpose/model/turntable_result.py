@@ -15,7 +15,6 @@ from lidarpose.model.turntable import TurntableMotion
 
 Kind = Literal["corners", "stripes", "ranges"]
 KINDS: tuple[Kind, ...] = ("corners", "stripes", "ranges")
-KIND_UNITS: dict[Kind, str] = {"corners": "px", "stripes": "px", "ranges": "m"}
 
 
 @dataclass(frozen=True)

@@ -54,9 +54,7 @@ from lidarpose.refine.noise import (
 from lidarpose.refine.place_effects import PlaceEffects, place_effects
 from lidarpose.refine.turntable_layout import JointData, Lines, thinned
 from lidarpose.refine.turntable_parameters import EXTRAS, N_GLOBAL, N_MOTION
-from lidarpose.refine.turntable_residuals import (
-    LineResiduals,
-)
+from lidarpose.refine.turntable_residuals import LineResiduals
 from lidarpose.refine.turntable_state import JointState
 
 

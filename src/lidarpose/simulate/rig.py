@@ -29,7 +29,6 @@ from lidarpose.simulate.light_sheet import beam_on_panel, chord_on_plate
 PAPER_PLACES = 87
 PAPER_ARC_DEG = 21.5
 PAPER_MARGIN_M = 0.015
-LMS4000_STEP_RAD = float(np.deg2rad(1.0 / 12.0))
 
 # A stripe is of use if it crosses this share of a panel's shorter side within the squares.
 _LEAST_CHORD_SHARE = 0.5

@@ -90,20 +90,3 @@ def svd_pose(world: ArrayLike, lidar: ArrayLike, *, weights: ArrayLike | None = 
     mean_w, mean_p = share @ w, share @ p
     R = nearest_rotation(((w - mean_w) * share[:, None]).T @ (p - mean_p))
     return Pose(R, mean_w - R @ mean_p)
-
-
-def mirrored_residual(world: ArrayLike, lidar: ArrayLike) -> float:
-    """RMS distance (m) of the best fit that may mirror as well as turn: smaller than the proper one's for left-handed
-    coordinates, equal for places in one plane."""
-    w, p = np.asarray(world, dtype=np.float64), np.asarray(lidar, dtype=np.float64)
-    cw, cp = w - w.mean(axis=0), p - p.mean(axis=0)
-    U, _, Vt = np.linalg.svd(cw.T @ cp)
-    if np.linalg.det(U @ Vt) > 0.0:
-        U = U * [1.0, 1.0, -1.0]
-    return float(np.sqrt(((cw - cp @ (U @ Vt).T) ** 2).sum(axis=1).mean()))
-
-
-def alignment_residual(T_world_lidar: Pose, world: ArrayLike, lidar: ArrayLike, scale: float = 1.0) -> float:
-    """RMS distance (m) between the world's corners and the LiDAR's, mapped."""
-    mapped = T_world_lidar @ (scale * np.asarray(lidar, dtype=np.float64))
-    return float(np.sqrt(((mapped - np.asarray(world)) ** 2).sum(axis=1).mean()))
