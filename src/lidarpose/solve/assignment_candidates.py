@@ -37,9 +37,10 @@ STRIPE_POINTS = 150
 ALPHA_SLACK_RAD = np.deg2rad(1.0)
 # A line may reach this far over the fold: noise of E, and a fold that is not sharp.
 FOLD_SLACK_M = 0.03
-# Shares of a stripe that its scan line covers, and of a scan line that its stripe covers, at least.
-LEAST_STRIPE_COVERED = 0.5
+# Share of a scan line that its stripe covers, at least, and of a stripe that its scan line covers: half, or where that
+# leaves a place none, as a piece of the line is lost or hidden, a fifth.
 LEAST_LINE_COVERED = 0.35
+LEAST_STRIPE_COVERED = (0.5, 0.2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +141,11 @@ def _candidates(
     ones = [fits.take(np.array([first_line[pair[0]] + pair[side] for pair in pairs])) for side in (1, 2)]
     alpha = np.array([stripes[k].alpha_rad for k, _, _ in pairs])
     extents = np.array([stripes[k].extents_m for k, _, _ in pairs])
-    kept = np.flatnonzero(_either_way(pairs, _plausible(ones[0], ones[1], alpha, extents)))
+    covered = _covered(ones[0], ones[1], alpha, extents)
+    plausible = covered >= LEAST_STRIPE_COVERED[0]
+    whole = {pair[0] for pair, is_plausible in zip(pairs, plausible, strict=True) if is_plausible}
+    plausible |= (covered >= LEAST_STRIPE_COVERED[1]) & [k not in whole for k, _, _ in pairs]
+    kept = np.flatnonzero(_either_way(pairs, plausible))
     pairs = [pairs[c] for c in kept.tolist()]
     lines = fit_line_pairs(ones[0].take(kept), ones[1].take(kept), alpha[kept])
     samples = single_poses([stripes[k] for k, _, _ in pairs], lines)
@@ -199,24 +204,26 @@ def _thinned(stripe: StripePoints) -> StripePoints:
     return StripePoints(stripe.pixels[some], stripe.normals[some], stripe.sigma_px[some])
 
 
-def _plausible(first: FittedLines, second: FittedLines, alpha: FloatArray, extents: FloatArray) -> BoolArray:
-    """Angle, gap at the fold and lengths of pairs of lines (C,) against the stripes': angle (C,), extents (C, 2, 2).
+def _covered(first: FittedLines, second: FittedLines, alpha: FloatArray, extents: FloatArray) -> FloatArray:
+    """The share (C,) of either stripe, the lesser, that pairs of lines cover; 0 where they cannot be the board's.
 
-    All as loose as sensors and edges are.
+    Angle, gap at the fold and lengths are held against the stripes': angle (C,), extents (C, 2, 2); all as loosely as
+    sensors and edges are.
     """
     E, directions = leaving_directions(first, second)
     between = np.arccos(np.clip((directions[:, 0] * directions[:, 1]).sum(axis=1), -1.0, 1.0))
     slack = 5.0 * np.hypot(first.direction_sigma_rad, second.direction_sigma_rad) + ALPHA_SLACK_RAD
     # Comparisons with NaN, of lines that are parallel, are false.
     good = np.abs(between - alpha) <= slack
+    covered = np.ones(len(alpha))
     for k, fit in enumerate((first, second)):
         along = np.sort(((fit.ends - E[:, None]) @ directions[:, k, :, None])[..., 0], axis=1)
         (low, high), (near, far) = along.T, extents[:, k].T
         common = np.minimum(high, far) - np.maximum(low, near)
         good &= low >= -FOLD_SLACK_M - 0.1 * (high - low)
-        good &= common >= LEAST_STRIPE_COVERED * (far - near)
         good &= common >= LEAST_LINE_COVERED * (high - low)
-    return np.asarray(good)
+        covered = np.minimum(covered, common / (far - near))
+    return np.where(good, covered, 0.0)
 
 
 def _spacing(line: ScanLine) -> float:

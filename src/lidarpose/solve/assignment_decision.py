@@ -15,7 +15,7 @@ from lidarpose.errors import AmbiguousError, InputError
 from lidarpose.geometry.arrays import FloatArray, IntArray, angle_between, unit
 from lidarpose.geometry.se3 import Pose, exp_se3, log_se3
 from lidarpose.model.observation import PlaceFeatures
-from lidarpose.solve.assignment_candidates import FOLD_SLACK_M, Candidate, Pool
+from lidarpose.solve.assignment_candidates import FOLD_SLACK_M, LEAST_STRIPE_COVERED, Candidate, Pool
 from lidarpose.solve.assignment_solutions import Solution, is_same, rms_misfit, support_of
 from lidarpose.solve.line_pair import FittedLines, fit_line_pairs
 from lidarpose.solve.panel_pose import PanelPose
@@ -300,12 +300,17 @@ def _ends_gain(pool: Pool, places: Sequence[PlaceFeatures], best: Solution, riva
     both = np.flatnonzero((best.chosen >= 0) & (rival.chosen >= 0))
     if len(both) < 2:
         return 0.0
-    differences = []
-    spacing = float(np.median([pool.candidates[best.chosen[p]].spacing_m for p in both]))
-    for solution in (best, rival):
-        chosen = [pool.candidates[solution.chosen[p]] for p in both]
-        off = np.stack([_ends_with_pieces(places[c.place], c) - c.stripes.extents_m for c in chosen])
-        differences.append(off[:, 0] - off[:, 1])
+    chosen = [[pool.candidates[s.chosen[p]] for p in both] for s in (best, rival)]
+    ends = np.array([[_ends_with_pieces(places[c.place], c) for c in own] for own in chosen])
+    stripes = np.array([[c.stripes.extents_m for c in own] for own in chosen])
+    spacing = float(np.median([c.spacing_m for c in chosen[0]]))
+    # Where neither order covers the stripes, a piece of a line is lost, and its end is not the panel's.
+    common = np.minimum(ends, stripes)[..., 1] - np.maximum(ends, stripes)[..., 0]
+    whole = (common > LEAST_STRIPE_COVERED[0] * np.ptp(stripes, axis=-1)).all(axis=2).any(axis=0)
+    if whole.sum() < 2:
+        return 0.0
+    off = (ends - stripes)[:, whole]
+    differences = off[:, :, 0] - off[:, :, 1]
     # Scatter from place to place, of the better one, never below two beams.
     scatter = [float(np.median(np.abs(d - np.median(d, axis=0)))) * 1.4826 for d in differences]
     sigma = max(min(scatter), 2.0 * spacing, 0.003)
