@@ -41,6 +41,7 @@ from lidarpose.simulate.rig import draw_rig
 from lidarpose.simulate.session import simulate_session
 from lidarpose.solve.paper import solve_paper
 from lidarpose.storage.clouds import ply, read_cloud, write_cloud
+from lidarpose.storage.corner_session import write_corner_session
 from lidarpose.workflows.turntable import calibrate_turntable
 from lidarpose.workflows.world import calibrate_world
 
@@ -268,6 +269,16 @@ def test_starting_imports_no_more_than_it_did() -> None:
     command = modules_of("--help")
     assert not command & {"numpy", "scipy", "cv2", "pydantic", "numba", "ruamel", "laspy", "markdown_it"}
     assert len(command) <= 340
+
+
+def test_a_command_on_a_plain_corner_session_imports_no_scipy(tmp_path: Path) -> None:
+    """Its import takes longer than all the searches for neighbours and pieces for which it would be used."""
+    session, _ = simulate_corner_session(CornerSceneSpec(pose="1", frames=2, seed=1))
+    write_corner_session(tmp_path / "session", session)
+    command = modules_of("calibrate", str(tmp_path / "session"), "-o", str(tmp_path / "out"), "--no-report", "--quiet")
+    assert (tmp_path / "out" / "calibration.json").is_file()
+    assert not command & {"scipy", "cv2", "pydantic", "numba", "numpy.ma"}
+    assert len(command) <= 560
 
 
 # --- the gate notices -----------------------------------------------------------------------------------------------

@@ -69,7 +69,10 @@ def test_nearest_points_are_those_of_a_tree(n: int) -> None:
 
     points = np.random.default_rng(n).normal(size=(n, 3)).astype(np.float32)
     seeds = points[::7]
-    np.testing.assert_array_equal(nearest(points, seeds, 12), cKDTree(points).query(seeds, k=12)[1])
+    expected = cKDTree(points).query(seeds, k=12)[1]
+    np.testing.assert_array_equal(nearest(points, seeds, 12), expected)
+    with compiled.forced(False):
+        np.testing.assert_array_equal(patch_evidence.nearest_points(points, seeds, 12), expected)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

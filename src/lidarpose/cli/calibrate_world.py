@@ -62,8 +62,6 @@ def calibrate_world_session(
     """
     from lidarpose.cli.console import progress
     from lidarpose.errors import InputError
-    from lidarpose.report.world_page import world_page
-    from lidarpose.storage.atomic import write_text
     from lidarpose.storage.calibration import read_turntable_calibration, write_calibration
     from lidarpose.storage.corner_session import read_corner_session, session_provenance, truth_beside
     from lidarpose.workflows.recorded_corners import with_scans
@@ -103,6 +101,9 @@ def calibrate_world_session(
     written = [output / "calibration.json"]
     write_calibration(written[0], calibration)
     if report:
+        from lidarpose.report.world_page import world_page
+        from lidarpose.storage.atomic import write_text
+
         written.append(output / "report.html")
         write_text(written[1], world_page(run))
     _print_result(run, truth_beside(session_folder), written, json)

@@ -39,6 +39,7 @@ from lidarpose.detect.plane_raster import (
     PlaneRaster,
     cell_size_m,
     grown,
+    largest_piece,
     raster_of,
 )
 from lidarpose.detect.plane_sample import (
@@ -52,6 +53,7 @@ from lidarpose.detect.plane_sample import (
 from lidarpose.geometry.arrays import BoolArray, IntArray, perpendicular_pair
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.planes import Plane
+from lidarpose.geometry.robust import median
 from lidarpose.model.plane_patch import PlanePatch
 
 # By how much they search a cloud sooner: its subsamples, and all points where a cloud is searched whole.
@@ -154,7 +156,7 @@ def segment_planes(points: NDArray[np.floating], search: PlaneSearch | None = No
             continue
         settled = True
         patches += found
-        sigma_m = float(np.median([p.sigma_m for p in patches]))
+        sigma_m = median(np.array([p.sigma_m for p in patches]))
     return tuple(patches)
 
 
@@ -327,12 +329,10 @@ def _moment_plane(points: NDArray[np.floating]) -> Plane:
 def largest_component(points: Float32Array, inside: BoolArray, plane: Plane) -> BoolArray:
     """Of the points `inside` (S,), those of the largest piece that hangs together across gaps, on the plane."""
     if pays(0.0, KERNELS):
-        from lidarpose.detect.patch_kernels import largest_piece
+        from lidarpose.detect.patch_kernels import largest_piece as compiled
 
         axes = np.stack(perpendicular_pair(plane.normal))
-        return np.asarray(largest_piece(points, inside, axes, MIN_GAP_M, GAP_PER_RANGE, MOST_CELLS))
-    from scipy import ndimage
-
+        return np.asarray(compiled(points, inside, axes, MIN_GAP_M, GAP_PER_RANGE, MOST_CELLS))
     members = np.flatnonzero(inside)
     result = np.zeros(len(points), dtype=bool)
     if len(members) == 0:
@@ -340,13 +340,8 @@ def largest_component(points: Float32Array, inside: BoolArray, plane: Plane) -> 
     chosen = points[members]
     # A thinned subsample has gaps of its own: twice the spacing that its own number and extent give.
     raster, cells = raster_of(chosen, plane, cell_size_m(chosen), 0)
-    occupied = np.bincount(cells[cells >= 0], minlength=raster.shape[0] * raster.shape[1]).reshape(raster.shape)
-    labels, pieces = ndimage.label(occupied > 0, structure=np.ones((3, 3)))
-    if pieces > 1:
-        sizes = np.bincount(labels.ravel(), weights=occupied.ravel())
-        sizes[0] = 0
-        keep = (cells >= 0) & (labels.ravel()[cells] == int(np.argmax(sizes)))
-        members = members[keep]
+    counts = np.bincount(cells[cells >= 0], minlength=raster.shape[0] * raster.shape[1]).reshape(raster.shape)
+    members = members[np.append(largest_piece(counts).ravel(), False)[cells]]
     result[members] = True
     return result
 

@@ -95,8 +95,10 @@ class _Cells:
         # Most stand where others do to the cell; of the rest it is asked more closely.
         alone = np.flatnonzero((taken.take(self.cell) & others) == 0)
         alone = alone[((taken.take(self._cells_around(alone)) & others) == 0).all(axis=0)]
-        _, number, count = np.unique(self.cell[alone], return_inverse=True, return_counts=True)
-        return np.asarray(self.index[alone[count[number] >= FEWEST_IN_A_CELL]])
+        cell = self.cell.take(alone)
+        ordered = np.sort(cell)
+        count = ordered.searchsorted(cell, "right") - ordered.searchsorted(cell, "left")
+        return np.asarray(self.index[alone[count >= FEWEST_IN_A_CELL]])
 
     def _cells_around(self, chosen: IntArray) -> NDArray[np.int32]:
         """The cells (8, M) in which a point stands that is moved by the slack along each axis, to and fro."""

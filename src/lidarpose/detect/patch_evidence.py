@@ -13,6 +13,10 @@ from lidarpose.geometry.robust import mad_sigma
 Float32Array = NDArray[np.float32]
 
 KERNELS = "detect.patch_kernels"
+# So many distances are looked through sooner than a tree is built; without kernels nearly as soon, and sooner by far
+# than SciPy's trees are imported. They are looked through in blocks that fit into a core's own memory.
+FEW_DISTANCES = 500_000
+DISTANCES_AT_ONCE = 32_768
 # Of trees that are asked few times: wide leaves are built sooner.
 LEAF_SIZE = 32
 GATE_SIGMAS = 3.0
@@ -106,20 +110,42 @@ def _neighbours_agree(points: Float32Array, normal: FloatArray, sigma_m: float) 
     if len(points) <= SCREENING_NEIGHBOURS:
         return True
     seeds = points[:: max(len(points) // SCREENED_POINTS, 1)]
-    if pays(0.0, KERNELS):
-        from lidarpose.detect.patch_kernels import nearest
-
-        neighbours = nearest(points, seeds, SCREENING_NEIGHBOURS)
-    else:
-        from scipy.spatial import cKDTree
-
-        tree = cKDTree(points, LEAF_SIZE, compact_nodes=False, balanced_tree=False)
-        neighbours = tree.query(seeds, k=SCREENING_NEIGHBOURS)[1]
+    neighbours = nearest_points(points, seeds, SCREENING_NEIGHBOURS)
     planes, variances = local_planes_of(points[neighbours])
     known = has_normal(variances, sigma_m)
     if np.count_nonzero(known) < ASKED_SHARE * len(known):
         return True
     return mostly_agree(planes[known, :3], normal)
+
+
+def nearest_points(points: Float32Array, seeds: Float32Array, count: int) -> IntArray:
+    """Positions (H, count) of the points (N, 3) nearest to each seed (H, 3), the nearest first."""
+    if len(seeds) * len(points) > FEW_DISTANCES:
+        from scipy.spatial import cKDTree
+
+        tree = cKDTree(points, LEAF_SIZE, compact_nodes=False, balanced_tree=False)
+        return np.asarray(tree.query(seeds, k=count)[1])
+    if pays(0.0, KERNELS):
+        from lidarpose.detect.patch_kernels import nearest
+
+        return np.asarray(nearest(points, seeds, count))
+    found = np.empty((len(seeds), count), dtype=np.int64)
+    columns, together = np.ascontiguousarray(points.T), max(DISTANCES_AT_ONCE // len(points), 1)
+    for first in range(0, len(seeds), together):
+        found[first : first + together] = _nearest(columns, seeds[first : first + together], count)
+    return found
+
+
+def _nearest(columns: Float32Array, seeds: Float32Array, count: int) -> IntArray:
+    """The same for few seeds and points in columns (3, N), by all distances."""
+    squares = (columns[0] - seeds[:, :1]) ** 2
+    for k in (1, 2):
+        d = columns[k] - seeds[:, k : k + 1]
+        d *= d
+        squares += d
+    near = np.argpartition(squares, count - 1, axis=1)[:, :count]
+    order = np.argsort(np.take_along_axis(squares, near, axis=1), axis=1)
+    return np.asarray(np.take_along_axis(near, order, axis=1))
 
 
 def first_in_each(points: NDArray[np.floating], side_m: float) -> IntArray:

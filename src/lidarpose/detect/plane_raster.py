@@ -17,6 +17,8 @@ GAP_PER_RANGE = 0.06
 MIN_GAP_M = 0.04
 # Of a raster, each way; what lies beyond is no part of it.
 MOST_CELLS = 4000
+# Pieces of rasters of more cells are found by SciPy, whose import takes a tenth of a second.
+FEW_CELLS = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,3 +97,42 @@ def grown(occupied: BoolArray) -> BoolArray:
     grown[:, 1:] |= wide[:, :-1]
     grown[:, :-1] |= wide[:, 1:]
     return grown
+
+
+def largest_piece(counts: IntArray) -> BoolArray:
+    """Of cells (n, m) with so many points each, those of the piece, joined over sides and corners, that holds most."""
+    occupied = counts > 0
+    if occupied.size > FEW_CELLS:
+        from scipy import ndimage
+
+        labels = ndimage.label(occupied, structure=np.ones((3, 3)))[0]
+        sizes = np.bincount(labels.ravel(), weights=counts.ravel())
+        sizes[0] = 0
+        return np.asarray(occupied & (labels == np.argmax(sizes)))
+    # All cells in the bits of one number, each row with an empty cell behind it: shifts reach all neighbours at once.
+    width = counts.shape[1] + 1
+    packed = np.packbits(np.pad(occupied, ((0, 0), (0, 1))), bitorder="little").tobytes()
+    left = int.from_bytes(packed, "little")
+    best, most, unseen = occupied, 0, int(counts.sum())
+    while most < unseen:
+        piece = _grown_from(left & -left, left, width)
+        if piece == left and not most:
+            return occupied
+        left ^= piece
+        bits = np.frombuffer(piece.to_bytes(len(packed), "little"), dtype=np.uint8)
+        cells = np.unpackbits(bits, bitorder="little", count=width * len(counts)).reshape(len(counts), width)[:, :-1]
+        held = int(counts[cells > 0].sum())
+        unseen -= held
+        if held > most:
+            best, most = cells > 0, held
+    return best
+
+
+def _grown_from(piece: int, occupied: int, width: int) -> int:
+    """All cells that hang together with some, in the bits of rows of a width."""
+    while True:
+        wide = piece | piece << 1 | piece >> 1
+        grown = (wide | wide << width | wide >> width) & occupied
+        if grown == piece:
+            return piece
+        piece = grown

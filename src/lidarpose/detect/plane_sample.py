@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from lidarpose.detect.patch_evidence import (
     GATE_SIGMAS,
     KERNELS,
-    LEAF_SIZE,
     MIN_SIGMA_M,
     Float32Array,
     has_normal,
     local_planes_of,
     mostly_agree,
+    nearest_points,
 )
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.compiled import pays
@@ -29,8 +29,6 @@ SAMPLE_SIZE = 4096
 DISTANCES_AT_ONCE = 65_536
 # Neighbours of fewer seeds are found sooner than a thread is started.
 MANY_HYPOTHESES = 400
-# So many distances are looked through by kernels sooner than a tree is built.
-FEW_DISTANCES = 400_000
 # So many hypotheses' neighbourhoods tell whether a patch is a surface.
 ENOUGH_SEEDS = 12
 # Neighbourhoods of a hypothesis, in nearest points of the subsample and of a quarter of it: wide ones reach
@@ -175,21 +173,10 @@ class _Neighbourhoods:
     def points(self) -> Float32Array:
         """(H, K, 3), by turns from more and from fewer of the nearest."""
         widest = min(NEIGHBOURHOODS[-1], len(self.cloud))
-        neighbours = self._nearest(widest)
+        neighbours = nearest_points(self.cloud, self.cloud[self.seeds], widest)
         reach = np.minimum(np.array(NEIGHBOURHOODS)[np.arange(len(self.seeds)) % len(NEIGHBOURHOODS)], widest)
         picks = (self.shares * reach[:, None]).astype(np.int64)
         return np.asarray(self.cloud[np.take_along_axis(neighbours, picks, axis=1)])
-
-    def _nearest(self, count: int) -> IntArray:
-        """Positions (H, count) of the points nearest to each seed, the nearest first."""
-        if len(self.seeds) * len(self.cloud) < FEW_DISTANCES and pays(0.0, KERNELS):
-            from lidarpose.detect.patch_kernels import nearest
-
-            return np.asarray(nearest(self.cloud, self.cloud[self.seeds], count))
-        from scipy.spatial import cKDTree
-
-        tree = cKDTree(self.cloud, LEAF_SIZE, compact_nodes=False, balanced_tree=False)
-        return np.asarray(tree.query(self.cloud[self.seeds], k=count)[1])
 
 
 def _noise_from_neighbourhoods(thickness: FloatArray) -> float:

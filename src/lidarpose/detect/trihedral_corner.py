@@ -14,7 +14,7 @@ from lidarpose.detect.crop import inside_box
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, cross3, perpendicular_pair, unit
 from lidarpose.geometry.compiled import pays
 from lidarpose.geometry.planes import Plane, intersect_three_planes
-from lidarpose.geometry.robust import quantile
+from lidarpose.geometry.robust import median, quantile
 from lidarpose.model.corner_result import CornerCandidate
 from lidarpose.model.plane_patch import PlanePatch
 
@@ -129,7 +129,7 @@ def _candidate(surfaces: list[_Surface], triple: IntArray, corner: FloatArray) -
         (outlines[0], outlines[1], outlines[2]),
         obstacles,
         min(len(p) for p in local),
-        float(np.median([f.sigma_m for f in faces])),
+        median(np.array([f.sigma_m for f in faces])),
     )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, unit
 from lidarpose.geometry.compiled import pays
+from lidarpose.geometry.robust import medians
 from lidarpose.geometry.threads import each
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.refine.face_systems import subset_of, tangents
@@ -192,14 +193,14 @@ def _common_part(face: _Face) -> tuple[FloatArray, FloatArray]:
     if pays(10.0 * SAVED_S_PER_RETURN * len(place), KERNELS):
         from lidarpose.refine.corner_kernels import farthest_out, reaches, within
 
-        most, least = (np.median(ends, axis=0) for ends in reaches(points, _ROUND, np.append(begins, len(place))))
+        most, least = (medians(ends, axis=0) for ends in reaches(points, _ROUND, np.append(begins, len(place))))
         near = np.flatnonzero(within(points, _ROUND, least - 1e-6, most + 1e-6))
         if FEWEST_RETURNS < near.size < place.size:
             points = points.take(near, axis=1)
         outermost = farthest_out(points, _ROUND)
     else:
         out = _ROUND @ points
-        most, least = (np.median(ends.reduceat(out, begins, axis=1), axis=1) for ends in (np.maximum, np.minimum))
+        most, least = (medians(ends.reduceat(out, begins, axis=1), axis=1) for ends in (np.maximum, np.minimum))
         beyond = out > most[:, None] + 1e-6
         beyond |= out < least[:, None] - 1e-6
         near = np.flatnonzero(~beyond.any(axis=0))

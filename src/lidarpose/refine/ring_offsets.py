@@ -17,6 +17,7 @@ import numpy as np
 
 from lidarpose.geometry.arrays import FloatArray, IntArray
 from lidarpose.geometry.rings import ring_numbers
+from lidarpose.geometry.robust import median
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
 from lidarpose.refine.corner_model import CornerFit, face_jacobians, joint_information
 from lidarpose.refine.face_systems import MIN_RETURNS, FaceSystem, weighted_rows
@@ -92,7 +93,7 @@ def find_rings(places: Sequence[CornerPlaceFaces]) -> Rings | None:
     if ring is None:
         return None
     count = np.bincount(ring)
-    if np.median(count) < RING_RETURNS:
+    if median(count.astype(np.float64)) < RING_RETURNS:
         return None
     elevation = np.arcsin(np.clip(np.bincount(ring, directions[:, 2]) / count, -1.0, 1.0))
     ends = np.cumsum([len(places[i].faces[j]) for i, j in keys])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
@@ -35,7 +34,7 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
             _clean_left_overs(path)
             if path.is_dir():
                 raise InputError(path, "is a folder", expected="the name of a file to write")
-            temporary = path.with_name(f"{path.stem}{_MARK}{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+            temporary = path.with_name(f"{path.stem}{_MARK}{os.getpid()}-{os.urandom(4).hex()}{path.suffix}")
             try:
                 yield temporary
                 if durable:
@@ -59,7 +58,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         If the folder cannot be made or written to.
     """
     path = Path(path).resolve()
-    mark = f"{_MARK}{os.getpid()}-{secrets.token_hex(4)}"
+    mark = f"{_MARK}{os.getpid()}-{os.urandom(4).hex()}"
     temporary, old = path.with_name(path.name + mark), path.with_name(path.name + mark + "-old")
     try:
         with _folder_made_for(path):

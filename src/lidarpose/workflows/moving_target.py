@@ -81,8 +81,7 @@ def find_by_motion(session: CornerSession, world: FloatArray, *, seed: int = 0) 
 
 def _widest_triangle(world: FloatArray) -> tuple[int, int, int]:
     """The three places whose triangle has the greatest height."""
-
-    few = np.unique(np.linspace(0, len(world) - 1, min(len(world), MOST_PLACES)).round().astype(int)).tolist()
+    few = np.linspace(0, len(world) - 1, min(len(world), MOST_PLACES)).round().astype(int).tolist()
     triples = np.array(list(combinations(few, 3)))
     p, q, r = world[triples].swapaxes(0, 1)
     longest = np.max([np.linalg.norm(side, axis=1) for side in (q - p, r - p, q - r)], axis=0)

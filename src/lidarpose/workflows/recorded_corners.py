@@ -1,4 +1,7 @@
-"""Sweep recordings as the clouds of a corner session: assembled in the camera's frame each time they are asked for."""
+"""Sweep recordings as the clouds of a corner session: assembled in the camera's frame each time they are asked for.
+
+What assembles is imported when it is asked for first: most sessions have no recordings.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,9 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry.arrays import FloatArray
-from lidarpose.measure.assemble import readings_between
-from lidarpose.measure.point_sigma import point_shifts, shifting_covariance
 from lidarpose.model.calibration import TurntableCalibration
 from lidarpose.model.cloud import Cloud
 from lidarpose.model.corner_session import CloudSource, CornerSession, RecordingSource, is_recording
-from lidarpose.workflows.scanning import ScanOptions, assemble_scan, in_true_angles
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +30,8 @@ class ScannedCloud:
         return self.source.name
 
     def load(self) -> Cloud:
+        from lidarpose.workflows.scanning import ScanOptions, assemble_scan
+
         options = ScanOptions(never_stops=self.never_stops, intensity=False)
         parts = [part.points for part in assemble_scan(self.source.recording(), self.calibration, options)]
         points = np.concatenate(parts) if parts else np.zeros((0, 3), dtype=np.float32)
@@ -38,11 +40,17 @@ class ScannedCloud:
     @property
     def parameter_covariance(self) -> FloatArray | None:
         """Of those parameters of the calibration that move points; None where it is not known."""
+        from lidarpose.measure.point_sigma import shifting_covariance
+
         return shifting_covariance(self.calibration)
 
     def shifts(self) -> Callable[[FloatArray], FloatArray]:
         """How points (n, 3) of the cloud move with the parameters of `parameter_covariance`: (n, 3, p)."""
         from scipy.spatial import cKDTree
+
+        from lidarpose.measure.assemble import readings_between
+        from lidarpose.measure.point_sigma import point_shifts
+        from lidarpose.workflows.scanning import ScanOptions, assemble_scan, in_true_angles
 
         recording = self.source.recording()
         options = ScanOptions(never_stops=self.never_stops, intensity=False, indices=True)

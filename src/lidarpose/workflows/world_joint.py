@@ -14,7 +14,7 @@ import numpy as np
 
 from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import BoolArray, FloatArray
-from lidarpose.geometry.robust import box_plot_inliers, mad_sigma
+from lidarpose.geometry.robust import box_plot_inliers, mad_sigma, median, medians
 from lidarpose.geometry.threads import each
 from lidarpose.model.calibration import Quality, WorldCalibration
 from lidarpose.model.corner_result import CornerPlaceFaces, FaceReturns
@@ -329,11 +329,11 @@ def _start(session: CornerSession, found: FoundTarget, fits: Sequence[FreeCorner
         world.append(place.corner_world)
     reference = normals[0]
     aligned = np.stack([n[list(face_order(n, reference)[0])] for n in normals])
-    common = np.median(aligned, axis=0)
+    common = medians(aligned, axis=0)
     common /= np.linalg.norm(common, axis=1, keepdims=True)
     errors = np.zeros((len(session.places), 3))
     pose = svd_pose(np.stack(world), np.stack(corners))
-    return CornerState(pose, common, 1.0, errors), float(np.median(sigmas))
+    return CornerState(pose, common, 1.0, errors), median(np.array(sigmas))
 
 
 def _corners(start: CornerState, fits: Sequence[FreeCorner | None], found: FoundTarget, *, sighted: bool) -> FloatArray:
@@ -362,7 +362,7 @@ def _without_odd_frames(
         corners = by_frame.get(place.position)
         good = np.ones(place.frames, dtype=bool)
         if corners is not None and place.frames >= MIN_FRAMES_FOR_BOX_PLOT:
-            good = parts.returns >= FEWER_RETURNS * np.median(parts.returns)
+            good = parts.returns >= FEWER_RETURNS * median(parts.returns.astype(np.float64))
             known = np.isfinite(corners).all(axis=1) & good
             if known.sum() >= MIN_FRAMES_FOR_BOX_PLOT:
                 # Quartiles of a few frames scatter themselves.
