@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lidarpose.errors import InputError
 from lidarpose.geometry.se3 import Pose
@@ -18,7 +19,7 @@ from lidarpose.model.image import GrayImage
 from lidarpose.model.scan import Scan
 from lidarpose.model.turntable_result import ResidualGroup
 from lidarpose.model.turntable_run import Deviation, TruthError, TurntableRun
-from lidarpose.report.turn_numbers import turn_numbers
+from lidarpose.report.turn_numbers import arc_deg, turn_numbers
 from lidarpose.report.turntable_page import turntable_page
 from lidarpose.report.turntable_scene import turntable_scene
 from tests_support.browser import Browser
@@ -133,6 +134,23 @@ def test_good_page_tells_its_numbers(good_run: TurntableRun) -> None:
     assert around >= figures["sigma_half_a_turn_away_mm"] * 0.999
     for words in ("87 of 87", "within the wish", "Table 1 of the turntable paper", "SHA-256", "scans/000.csv"):
         assert words in text
+
+
+def test_the_pose_on_the_page_is_that_of_the_calibration(good_run: TurntableRun) -> None:
+    """The matrix as it is copied from the page, against the calibration; the quaternion against SciPy."""
+    text = turntable_page(good_run, None)
+    low, high = arc_deg(good_run)
+    pose = good_run.calibration.pose(np.deg2rad(0.5 * (low + high)))
+    assert f"T_camera_lidar while the turntable reads {0.5 * (low + high):.2f}" in text
+    matrices = [np.loadtxt(block.splitlines()) for block in re.findall(r"<pre>(.*?)</pre>", text, re.DOTALL)]
+    np.testing.assert_allclose(matrices[0], pose.matrix, rtol=0.0, atol=6e-7)
+    motion = good_run.calibration.motion
+    np.testing.assert_allclose(matrices[1], motion.T_camera_turntable.matrix, rtol=0.0, atol=6e-7)
+    np.testing.assert_allclose(matrices[2], motion.T_turntable_lidar.matrix, rtol=0.0, atol=6e-7)
+    found = re.search(r"quaternion x y z w</td><td><code>(.*?)</code>", text)
+    assert found is not None
+    R = Rotation.from_quat([float(word) for word in found[1].split()]).as_matrix()
+    np.testing.assert_allclose(R, pose.rotation, rtol=0.0, atol=3e-6)
 
 
 def test_bad_page_says_what_is_wrong_and_what_to_do(bad_run: TurntableRun) -> None:

@@ -58,6 +58,18 @@ def test_good_page_tells_its_numbers(runs: dict[str, WorldRun]) -> None:
         assert words in text
 
 
+def test_the_matrix_on_the_page_holds_the_scale(runs: dict[str, WorldRun]) -> None:
+    calibration = replace(runs["good"].calibration, scale=1.002)
+    text = world_page(replace(runs["good"], calibration=calibration))
+    found = re.search(r"<pre>(.*?)</pre>", text, re.DOTALL)
+    assert found is not None
+    T = np.loadtxt(found[1].splitlines())
+    np.testing.assert_allclose(T[:3, :3], 1.002 * calibration.T_world_source.rotation, rtol=0.0, atol=6e-7)
+    np.testing.assert_allclose(T[:3, 3], calibration.T_world_source.translation, rtol=0.0, atol=6e-7)
+    assert "--to ros2" not in text
+    assert "--to ros2" in world_page(runs["good"])
+
+
 def test_bad_page_names_the_place_at_fault(runs: dict[str, WorldRun]) -> None:
     text = world_page(runs["bad"])
     verdict = text[text.index('id="verdict"') : text.index('class="tiles"')]

@@ -173,6 +173,23 @@ def test_opencv_reads_its_own(tmp_path: Path, suffix: str, angle_deg: float) -> 
 
 
 @pytest.mark.parametrize("angle_deg", ANGLES_DEG)
+def test_the_matrix_as_numpy_reads_it(tmp_path: Path, angle_deg: float) -> None:
+    calibration = turntable(8)
+    write_export(tmp_path / "T.txt", calibration, "matrix", ExportOptions(angle_rad=np.deg2rad(angle_deg)))
+    text = (tmp_path / "T.txt").read_text()
+    assert [len(line.split(" ")) for line in text.splitlines()] == [4, 4, 4, 4]
+    same((np.loadtxt(tmp_path / "T.txt") @ np.append(POINT, 1.0))[:3], camera_point(calibration, angle_deg))
+
+
+def test_the_matrix_holds_a_scale(tmp_path: Path) -> None:
+    calibration = world(scale=1.01)
+    write_export(tmp_path / "T.txt", calibration, "matrix")
+    pose = calibration.T_world_source
+    wanted = 1.01 * pose.rotation @ POINT + pose.translation
+    same((np.loadtxt(tmp_path / "T.txt") @ np.append(POINT, 1.0))[:3], wanted)
+
+
+@pytest.mark.parametrize("angle_deg", ANGLES_DEG)
 def test_kalibr_s_camchain(tmp_path: Path, angle_deg: float) -> None:
     calibration = turntable(5)
     path = tmp_path / "camchain.yaml"
@@ -217,7 +234,7 @@ def test_csv_of_poses_over_angles() -> None:
     assert "sigma" not in export_text(turntable(6, covariance=False), "csv").splitlines()[2]
 
 
-@pytest.mark.parametrize("to", EXPORT_FORMATS)
+@pytest.mark.parametrize("to", sorted({*EXPORT_FORMATS} - {"matrix"}))
 @pytest.mark.parametrize("calibration", [turntable(), world("camera")], ids=["turntable", "world"])
 def test_each_file_states_its_direction(to: str, calibration: Calibration) -> None:
     text = export_text(calibration, to)

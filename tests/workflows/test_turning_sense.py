@@ -37,7 +37,9 @@ def test_a_statement_fills_what_another_leaves_open_and_is_said() -> None:
     assert both == StatedSense("anticlockwise-from-camera", "anticlockwise-from-above")
     motion = TurntableMotion(UP, UPRIGHT)
     assert "Both were compared" in turning_sense(motion, 0.3, both)
-    assert "--beams-turn anticlockwise-from-above" in turning_sense(motion, 0.3, on_command_line)
+    asked = turning_sense(motion, 0.3, on_command_line)
+    assert "this would be --table-turns anticlockwise-from-above" in asked  # and not what is stated already
+    assert "this would be --beams-turn anticlockwise-from-above --table-turns" in turning_sense(motion, 0.3)
 
 
 READINGS = (0.1, 0.3, 0.5)

@@ -14,7 +14,7 @@ def export(
     calibration: Path,
     /,
     *,
-    to: Literal["ros2", "urdf", "kalibr", "opencv", "csv"],
+    to: Literal["ros2", "urdf", "kalibr", "opencv", "csv", "matrix"],
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     angle_deg: FiniteFloat | None = None,
     camera: Path | None = None,
@@ -31,12 +31,14 @@ def export(
         A calibration file.
     to
         ros2: a launch file; urdf: a robot description with the turntable as a joint; kalibr: a camchain;
-        opencv: a FileStorage, XML if the output is named so, else YAML; csv: poses over angles.
+        opencv: a FileStorage, XML if the output is named so, else YAML; csv: poses over angles; matrix:
+        the pose in four lines of four numbers, for CloudCompare, Open3D and numpy.loadtxt.
     output
         The file to write.
     angle_deg
         The turntable's reading for which to write one pose. Without it: ros2 moves with the joint, csv has every
-        degree of a turn, kalibr and opencv hold the pose at 0 and the two transforms that give all others.
+        degree of a turn, matrix holds the pose at 0, kalibr and opencv that and the two transforms that give all
+        others.
     camera
         A camera file whose intrinsics go into kalibr and opencv.
     camera_frame
@@ -61,12 +63,12 @@ def export(
     require_apart(output, calibration, camera)
     loaded = read_calibration(calibration)
     scale = loaded.motion.reading_scale if isinstance(loaded, TurntableCalibration) else 1.0
-    one_pose = to == "ros2" and angle_deg is not None
+    one_pose = to in ("ros2", "matrix") and angle_deg is not None
     if scale != 1.0 and to != "csv" and not one_pose:
         raise InputError(
             calibration,
             f"has readings that are off by a factor ({scale:.6g}); {to} knows none",
-            expected="--to csv, or --to ros2 with --angle-deg for one pose",
+            expected="--to csv, or --to ros2 or matrix with --angle-deg for one pose",
         )
     if camera is not None and to not in ("kalibr", "opencv"):
         raise InputError("--camera", f"has no place in {to}", expected="--to kalibr or --to opencv")

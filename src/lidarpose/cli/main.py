@@ -29,7 +29,10 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("lidarpose.cli.calibrate:calibrate", "Find the LiDAR's pose from a session."),
     "scan": ("lidarpose.cli.scan:scan", "Turn a sweep recording into a 3D cloud."),
     "import": ("lidarpose.cli.import_bag:import_bag", "Make a recording or session of a ROS bag or of packets."),
-    "export": ("lidarpose.cli.export:export", "Write a calibration for ROS 2, URDF, Kalibr, OpenCV, or as CSV."),
+    "export": (
+        "lidarpose.cli.export:export",
+        "Write a calibration for ROS 2, URDF, Kalibr, OpenCV, CloudCompare, or as CSV.",
+    ),
     "view": ("lidarpose.cli.view:view", "Look at clouds and rigs in 3D, or write a recording to send."),
     "pose": ("lidarpose.cli.pose:pose", "The LiDAR's pose at a turntable angle, with its standard deviations."),
 }

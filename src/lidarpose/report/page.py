@@ -47,6 +47,11 @@ class Verdict:
     reasons: Sequence[str] = ()
     todo: Sequence[str] = ()
 
+    @property
+    def heading(self) -> str:
+        """What stands over the reasons: a good result needs none, and has remarks only."""
+        return "To note" if self.tone == "good" else "Why"
+
 
 def headline(tone: Tone) -> str:
     """What a calibration's verdict says first."""
@@ -84,7 +89,7 @@ def verdict_block(verdict: Verdict) -> Markup:
         el("p", verdict.say, class_="say"),
     ]
     if verdict.reasons:
-        parts += [el("h3", "Why"), bullets(verdict.reasons)]
+        parts += [el("h3", verdict.heading), bullets(verdict.reasons)]
     if verdict.todo:
         parts.append(el("div", el("h3", "What to do"), bullets(verdict.todo, ordered=True), class_="todo"))
     return el("section", *parts, class_=f"verdict {verdict.tone}", id="verdict")

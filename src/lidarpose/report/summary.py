@@ -26,7 +26,7 @@ def print_verdict(console: Console, verdict: Verdict) -> None:
     word = "none" if verdict.tone == "unknown" else verdict.tone
     console.print(Text.assemble("verdict: ", (word, _STYLES[verdict.tone])))
     console.print(Text(verdict.say), soft_wrap=not console.is_terminal)
-    _print_list(console, "Why", verdict.reasons, numbered=False)
+    _print_list(console, verdict.heading, verdict.reasons, numbered=False)
     _print_list(console, "What to do", verdict.todo, numbered=True)
 
 

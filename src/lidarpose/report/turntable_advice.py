@@ -43,7 +43,8 @@ def todo(run: TurntableRun) -> tuple[str, ...]:
         return ()
     steps = list(dict.fromkeys(_steps(run)))
     if quality is not None and quality.verdict == "rejected":
-        steps.append("Until then, do not measure with this calibration.json: its numbers are not trustworthy.")
+        until = "until then do not measure with this calibration.json: its numbers are not trustworthy."
+        steps.append(until.capitalize() if steps else f"Correct what the reasons name and calibrate again; {until}")
     return tuple(steps)
 
 

@@ -14,6 +14,7 @@ from lidarpose.model.turntable_run import TruthError, TurntableRun
 from lidarpose.report import turntable_certainty as certainty
 from lidarpose.report import turntable_residuals as residuals
 from lidarpose.report import turntable_seen as seen
+from lidarpose.report.answer import answer_section
 from lidarpose.report.markup import Markup, el
 from lidarpose.report.numbers import fixed, plural, short
 from lidarpose.report.page import (
@@ -65,6 +66,7 @@ def turntable_page(
         tiles(_tiles(run, numbers)),
         *_truth_section(truth),
         _rig_section(run),
+        answer_section(run.calibration, 0.5 * sum(arc_deg(run))),
         _seen_section(run, board_image),
         *_residual_sections(run),
         *_certainty_sections(run, numbers),

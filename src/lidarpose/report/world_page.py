@@ -11,6 +11,7 @@ from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import UncertainPose, skew
 from lidarpose.model.world_run import WorldRun
 from lidarpose.report import world_figures as figures
+from lidarpose.report.answer import answer_section
 from lidarpose.report.markup import Markup, el
 from lidarpose.report.numbers import fixed, short
 from lidarpose.report.page import (
@@ -43,6 +44,7 @@ def world_page(run: WorldRun) -> str:
         verdict_block(world_verdict(run)),
         tiles(_tiles(run)),
         _scene_section(run),
+        answer_section(run.calibration),
         *_figure_sections(run),
         _alignment_section(run),
         _left_out_section(run),

@@ -44,11 +44,14 @@ def turning_sense(motion: TurntableMotion, turntable_angle_rad: float, stated: S
     beams = _plainest(_beam_axis(motion, turntable_angle_rad))
     table = _plainest(motion.axis_direction_camera)
     found = f"By the files growing beam angles turn {_said(beams)}, and growing readings turn {_said(table)}."
-    if stated is not None and stated.beams and stated.table:
+    known = stated or StatedSense()
+    options = [] if known.beams else [f"--beams-turn {beams}"]
+    options += [] if known.table else [f"--table-turns {table}"]
+    if not options:
         return f"{found} Both were compared with what was stated"
     return (
         f"{found} Compare with the rig: no residual shows scans in reverse or negated readings. To have it checked, "
-        f"state what you see; this would be --beams-turn {beams} --table-turns {table} (or [turning] in session.toml)"
+        f"state what you see; this would be {' '.join(options)} (or [turning] in session.toml)"
     )
 
 

@@ -1,4 +1,6 @@
-"""Calibrations for other programs: ROS 2, URDF, Kalibr, OpenCV, CSV. Each file states its direction in a comment.
+"""Calibrations for other programs: ROS 2, URDF, Kalibr, OpenCV, CSV, a bare matrix.
+
+Each file but the matrix states its direction in a comment.
 
 Numbers have all the digits of a double, so that what another program computes from a file agrees with `pose`.
 """
@@ -11,7 +13,7 @@ from pathlib import Path
 from lidarpose.errors import InputError
 from lidarpose.model.calibration import Calibration
 from lidarpose.storage.atomic import write_text
-from lidarpose.storage.exports import kalibr, opencv, poses_csv, ros2, urdf
+from lidarpose.storage.exports import kalibr, matrix, opencv, poses_csv, ros2, urdf
 from lidarpose.storage.exports.common import ExportOptions, FrameNames
 
 _TEXTS: dict[str, Callable[[Calibration, ExportOptions], str]] = {
@@ -20,6 +22,7 @@ _TEXTS: dict[str, Callable[[Calibration, ExportOptions], str]] = {
     "kalibr": kalibr.text,
     "opencv": opencv.text,
     "csv": poses_csv.text,
+    "matrix": matrix.text,
 }
 EXPORT_FORMATS = tuple(_TEXTS)
 """What `export_text` knows."""

@@ -71,7 +71,7 @@ def require_rigid(calibration: WorldCalibration, to: str) -> None:
             f"--to {to}",
             f"cannot hold the scale {calibration.scale:.9g} of this calibration",
             expected="a rigid transform",
-            remedy="Calibrate with metric clouds and no estimate of scale, or export to csv or opencv.",
+            remedy="Calibrate with metric clouds and no estimate of scale, or export to csv, opencv or matrix.",
         )
 
 
