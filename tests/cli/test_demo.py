@@ -16,6 +16,11 @@ def test_the_demonstration_ends_well(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert (tmp_path / "out" / name).stat().st_size > 1000
 
 
+def test_the_status_is_that_of_the_step_that_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["demo", str(tmp_path / "out"), "--places", "0"]) == 2
+    assert capsys.readouterr().err.count("lidarpose: ") == 1
+
+
 def test_a_folder_with_something_else_in_it_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "thesis.txt").write_text("precious")
     assert run(["demo", str(tmp_path)]) == 2

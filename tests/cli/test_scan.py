@@ -1,6 +1,8 @@
 """`lidarpose scan` on small recordings, end to end."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +120,20 @@ def test_no_file_that_is_read_is_replaced(folder: Path, name: str, capsys: pytes
     assert run(["scan", str(folder / "rec"), str(folder / "cal.json"), "-o", str(folder / name)]) == 2
     assert "is read by this command" in capsys.readouterr().err
     assert (folder / name).read_bytes() == before
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".las", ".laz", ".e57"])
+def test_a_full_disk_is_one_message_and_leaves_nothing(folder: Path, suffix: str) -> None:
+    limited = (
+        "import resource, sys; from lidarpose.cli.main import run; "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500)); sys.exit(run(sys.argv[1:]))"
+    )
+    command = ["scan", str(folder / "rec"), str(folder / "cal.json"), "-o", str(folder / f"cloud{suffix}")]
+    done = subprocess.run([sys.executable, "-c", limited, *command], capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    assert f"cloud{suffix}: cannot be written: " in done.stderr
+    assert not [*folder.glob("cloud*")]
 
 
 def test_a_session_is_no_recording(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,6 +7,8 @@ nothing else.
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -17,6 +19,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _REDRAWN_EVERY_S = 0.1
+# Tables are laid out for so many columns at least, and where nobody looks for as many as they need: a narrower terminal
+# breaks their lines, but no number is cut short.
+_LEAST_COLUMNS, _ALL_COLUMNS = 80, 400
 
 
 class Advance(Protocol):
@@ -29,7 +34,14 @@ def out() -> Console:
     """Standard output for people: colour on a terminal, plain text in whole lines elsewhere."""
     from rich.console import Console
 
-    return Console(highlight=False, soft_wrap=not sys.stdout.isatty())
+    class Standard(Console):
+        def on_broken_pipe(self) -> None:
+            """Go on: the exit status is for what the command found, whether anybody reads it or not."""
+            hang_up()
+
+    watched = sys.stdout.isatty()
+    width = max(shutil.get_terminal_size().columns, _LEAST_COLUMNS) if watched else _ALL_COLUMNS
+    return Standard(highlight=False, soft_wrap=not watched, width=width)
 
 
 def err() -> Console:
@@ -37,6 +49,11 @@ def err() -> Console:
     from rich.console import Console
 
     return Console(stderr=True, highlight=False, soft_wrap=not sys.stderr.isatty())
+
+
+def hang_up() -> None:
+    """Send what is still to be printed nowhere: the reader of our output went away, or it cannot be written."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def print_json(value: Mapping[str, Any]) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from lidarpose.errors import InputError, LidarposeError
+from lidarpose.errors import InputError
 
 
 def demo(
@@ -29,13 +29,15 @@ def demo(
     seed
         The same seed gives the same data.
     """
+    from lidarpose.cli.main import call
+
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / ".lidarpose-demo").exists())):
         raise InputError(out, "is there already and holds something else", expected="a new or empty folder")
     out.mkdir(parents=True, exist_ok=True)
     (out / ".lidarpose-demo").touch()
     for text, command in _steps(out, places, seed):
         _show(text, command)
-        _run(command)
+        call(command)
     _say(f"Look at {out / 'turntable-result' / 'report.html'} and {out / 'world-result' / 'report.html'}.")
 
 
@@ -73,11 +75,3 @@ def _say(text: str, style: str | None = None) -> None:
     from lidarpose.cli.console import out as console
 
     console().print(text, style=style, markup=False, soft_wrap=True)
-
-
-def _run(command: list[str]) -> None:
-    from lidarpose.cli.main import EXIT_DONE, run
-
-    status = run(command)
-    if status != EXIT_DONE:
-        raise LidarposeError(f"the demonstration stopped: lidarpose {shlex.join(command)} ended with status {status}")

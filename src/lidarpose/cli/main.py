@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -94,24 +95,46 @@ def build_app() -> App:
 
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status; messages go to standard error."""
-    from cyclopts import CycloptsError
-
     try:
-        build_app()(arguments, exit_on_error=False, print_error=False, result_action="return_value")
-    except CycloptsError as error:
-        hint = f"See: {' '.join(('lidarpose', *(error.command_chain or ())))} --help"
-        return _complain(_usage(error), hint=hint, status=EXIT_WRONG_INPUT)
+        from cyclopts import CycloptsError
+
+        try:
+            call(arguments)
+        finally:
+            sys.stdout.flush()
+    except KeyboardInterrupt:
+        return _complain("interrupted; nothing half-written is left behind", status=EXIT_INTERRUPTED)
     except InputError as error:
         return _complain(str(error), status=EXIT_WRONG_INPUT)
     except LidarposeError as error:
         return _complain(str(error), status=EXIT_UNDETERMINED)
-    except BrokenPipeError:
-        # The reader of our output went away (`lidarpose ... | head`); there is nobody left to tell.
-        sys.stderr.close()
+    except OSError as error:
+        return _unwritten(error)
+    except SystemExit:
+        # So the help ends where its reader went away.
         return EXIT_DONE
-    except KeyboardInterrupt:
-        return _complain("interrupted; nothing half-written is left behind", status=EXIT_INTERRUPTED)
+    except CycloptsError as error:
+        hint = f"See: {' '.join(('lidarpose', *(error.command_chain or ())))} --help"
+        return _complain(_usage(error), hint=hint, status=EXIT_WRONG_INPUT)
     return EXIT_DONE
+
+
+def call(arguments: Sequence[str] | None = None) -> None:
+    """Run one command and let its errors through."""
+    build_app()(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+
+
+def _unwritten(error: OSError) -> int:
+    """Standard output, or a file that no reader or writer looked after, could not be read or written."""
+    from lidarpose.cli.console import hang_up
+
+    if error.filename is None:
+        hang_up()
+    if isinstance(error, BrokenPipeError):
+        # The reader of our output went away (`lidarpose ... | head`); there is nobody left to tell.
+        return EXIT_DONE
+    where = error.filename or "standard output"
+    return _complain(f"{where}: {error.strerror or error}", status=EXIT_WRONG_INPUT)
 
 
 def _usage(error: CycloptsError) -> str:
@@ -137,9 +160,20 @@ def _complain(message: str, *, status: int, hint: str | None = None) -> int:
     return status
 
 
+def _prepare_streams() -> None:
+    """Print as an escape what the output's encoding has no sign for, and to nowhere what goes to a closed stream."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, io.StringIO())
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
 def main() -> None:
     """Console script."""
     gc.set_threshold(_GARBAGE_THRESHOLD)
+    _prepare_streams()
     status = run()
     # The interpreter searches all objects for garbage once more as it ends: a fifth of the start, for nothing. To the
     # packets' decoder what is not searched looks like a leak, and it prints pages about that.

@@ -82,8 +82,8 @@ def _print_table(angle_deg: float, at_angle: Pose, uncertain: UncertainPose | No
     out().print(table)
     quaternion = " ".join(f"{value:.7f}" for value in at_angle.quaternion_xyzw)
     out().print(
-        "p_camera = T_camera_lidar p_lidar. Columns: the LiDAR's axes and centre, seen from the camera (x right, y down, "
-        f"z forward). Quaternion x y z w: {quaternion}"
+        "p_camera = T_camera_lidar p_lidar. Columns: the LiDAR's axes and centre, seen from the camera (x right, y "
+        f"down, z forward). Quaternion x y z w: {quaternion}"
     )
     if uncertain is None:
         out().print("The calibration file holds no covariance: how sure this is, is not known.")

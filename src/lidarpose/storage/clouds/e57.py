@@ -189,7 +189,8 @@ def _pose(path: Path, place: str, scan: Any) -> Pose | None:
 @contextmanager
 def writer(path: Path, columns: Columns, shown: Path) -> Iterator[_Writer]:
     """Write one scan, a chunk at a time; coordinates keep their precision, single or double."""
-    image = libe57.ImageFile(str(path), "w")
+    with _as_os_errors():
+        image = libe57.ImageFile(str(path), "w")
     try:
         out = _Writer(image, columns, shown)
         yield out
@@ -197,7 +198,17 @@ def writer(path: Path, columns: Columns, shown: Path) -> Iterator[_Writer]:
     except BaseException:
         image.cancel()
         raise
-    image.close()
+    with _as_os_errors():
+        image.close()
+
+
+@contextmanager
+def _as_os_errors() -> Iterator[None]:
+    """A full disk, as libE57 tells it, is an OSError like any other."""
+    try:
+        yield
+    except Exception as error:  # libE57's own exception, and RuntimeErrors of its binding
+        raise OSError(f"libE57 says: {' '.join(str(error).split())[:200]}") from error
 
 
 class _Writer:
@@ -224,10 +235,13 @@ class _Writer:
                 self._arrays[name][:count] = np.where(finite, points[:, axis], 0.0)
             for theirs, ours in self._fields.items():
                 self._arrays[theirs][:count] = cloud.fields[ours][block]
-            self._out.write(count)
+            with _as_os_errors():
+                self._out.write(count)
 
     def close(self) -> None:
-        self._out.close()
+        """End the scan."""
+        with _as_os_errors():
+            self._out.close()
 
     def _their_name(self, name: str, item: np.dtype[Any]) -> str:
         if item.shape or item.kind not in "fiu" or item in (np.float16, np.uint64) or item.itemsize > 8:

@@ -162,6 +162,15 @@ def writer(path: Path, columns: Columns, shown: Path) -> Iterator[_Writer]:
         out.close()
 
 
+@contextmanager
+def _as_os_errors() -> Iterator[None]:
+    """A full disk, as lazrs tells it, is an OSError like any other."""
+    try:
+        yield
+    except lazrs.LazrsError as error:
+        raise OSError(str(error)) from error
+
+
 class _Writer:
     def __init__(self, path: Path, columns: Columns, shown: Path) -> None:
         self._path, self._columns, self._shown = path, columns, shown
@@ -185,7 +194,8 @@ class _Writer:
 
     def close(self) -> None:
         if self._out is not None:
-            self._out.close()
+            with _as_os_errors():
+                self._out.close()
 
     def _open(self, offset: NDArray[Any]) -> None:
         has_time = "time" in self._columns.fields
@@ -229,7 +239,8 @@ class _Writer:
         record.X, record.Y, record.Z = steps.astype(np.int32).T
         for name in self._columns.fields:
             self._set(record, name, cloud.fields[name][block])
-        self._out.write_points(record)
+        with _as_os_errors():
+            self._out.write_points(record)
 
     def _set(self, record: Any, name: str, column: NDArray[Any]) -> None:
         extra = set(self._header.point_format.extra_dimension_names)
