@@ -127,8 +127,8 @@ _FRAMES_COMMAND = (
     "In processor time the process that reads takes 0.17 s, of which reading the frames is a fifth and the rest "
     "Python's start, NumPy and the readers; the command takes 0.44, without report 0.40 (least of nine each). Of that "
     "0.2 s are imports (NumPy and the line's parser 0.07, the methods' modules 0.05, printing 0.015, versions for the "
-    "record 0.01) and 0.16 the job by NumPy, as above: kernels would take longer to load than they save. For 2, a tenth "
-    "of a second would have to go, more than half of the job.\n"
+    "record 0.01) and 0.16 the job by NumPy, as above: kernels would take longer to load than they save. For 2, a "
+    "tenth of a second would have to go, more than half of the job.\n"
     "Tried: neighbours and pieces of small clouds without SciPy, whose import took 0.2 s for 3 ms of work; what "
     "reports, recordings and masked arrays need imported only for those. Before that the command took 0.65 s."
 )
@@ -150,10 +150,9 @@ _FRAMES = (
     "a frame's bytes cost half of what reading it as the reference does, one pass in vector instructions 0.2 of it, "
     "headers and calls the rest, which the cores cannot share. Mapped files, with all their pages at once too, and "
     "blocks of 64 and 128 kB take as long as whole frames into the same memory; a voxel map of which few pages are "
-    "touched saves half a millisecond; a frame opened and "
-    "read once, header and points together, takes the same processor time as both apart. Cutting to the faces' own slabs would leave "
-    "four fifths of the returns. Not tried: single precision for selecting; merging returns of one beam over "
-    "frames, which need not repeat them."
+    "touched saves half a millisecond; a frame opened and read once, header and points together, takes the same "
+    "processor time as both apart. Cutting to the faces' own slabs would leave four fifths of the returns. Not "
+    "tried: single precision for selecting; merging returns of one beam over frames, which need not repeat them."
 )
 
 METRICS: tuple[Metric, ...] = (
