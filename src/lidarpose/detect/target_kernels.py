@@ -201,85 +201,7 @@ def far_inside(points: Any, inward: Any, least: Any, begin: int, end: int) -> An
 
 
 @kernel
-def faces_met(
-    rays: Any,
-    range_m: Any,
-    gate_m: float,
-    normals: Any,
-    heights: Any,
-    convex: bool,
-    inward: Any,
-    least: Any,
-    starts: Any,
-    margins_m: Any,
-    obstacles: Any,
-    gaps_m: Any,
-) -> Any:
-    """The face (N,) that each return is of, 0 to 2, or -1.
-
-    Parameters
-    ----------
-    rays, range_m : (3, N), (N,)
-        Unit beam directions and measured ranges.
-    gate_m
-        How far a range may be from the one expected.
-    normals, heights
-        The three planes (3, 3), (3,).
-    inward, least, starts
-        All outlines' edges (E, 3), how far along each a point has to lie (E,), and where each outline's begin (4,).
-    margins_m : (3, 3)
-        How far a point of one face has to be from the plane of another.
-    obstacles, gaps_m
-        Planes as normal and offset (B, 4), and how far off them a point of each face has to be (3, B).
-    """
-    x, y, z = rays[0], rays[1], rays[2]
-    found = np.full(len(range_m), -1, np.int8)
-    # Everything is asked of many beams at a time, which vector instructions do together.
-    first, reach = np.empty(_BEAMS, np.int64), np.empty(_BEAMS)
-    point, who = np.empty((3, 3, _BEAMS)), np.empty((3, _BEAMS), np.int64)
-    many = np.zeros(3, np.int64)
-    for begin in range(0, len(range_m), _BEAMS):
-        size = min(_BEAMS, len(range_m) - begin)
-        first_met(x[begin:], y[begin:], z[begin:], normals, heights, convex, size, first, reach)
-        many[:] = 0
-        for k in range(size):
-            i, expected, face = begin + k, reach[k], first[k]
-            if not abs(range_m[i] - expected) < gate_m:
-                continue
-            px, py, pz = x[i] * expected, y[i] * expected, z[i] * expected
-            good = True
-            for other in range(3):
-                slope = normals[other, 0] * x[i] + normals[other, 1] * y[i] + normals[other, 2] * z[i]
-                good &= other == face or abs(slope * expected - heights[other]) > margins_m[face, other]
-            for b in range(len(obstacles)):
-                off = obstacles[b, 0] * px + obstacles[b, 1] * py + obstacles[b, 2] * pz - obstacles[b, 3]
-                good &= off > gaps_m[face, b]
-            at = many[face]
-            point[face, 0, at], point[face, 1, at], point[face, 2, at] = px, py, pz
-            who[face, at] = i
-            many[face] += good
-        for face in range(3):
-            inside = far_inside(point[face, :, : many[face]], inward, least, starts[face], starts[face + 1])
-            for at in range(many[face]):
-                if inside[at] > 0.0:
-                    found[who[face, at]] = face
-    return found
-
-
-@kernel
-def outside(rays: Any, normal: Any, height: float, inward: Any, least: Any) -> Any:
-    """Which rays (3, N) to a plane meet it outside of an outline's edges, or on them."""
-    x, y, z = rays[0], rays[1], rays[2]
-    a, b, c = normal[0], normal[1], normal[2]
-    points = np.empty((3, len(x)))
-    for i in range(len(x)):
-        reach = height / (a * x[i] + b * y[i] + c * z[i])
-        points[0, i], points[1, i], points[2, i] = x[i] * reach, y[i] * reach, z[i] * reach
-    return far_inside(points, inward, least, 0, len(least)) <= 0.0
-
-
-@kernel
-def off_others(
+def _off_others(
     beams: Any,
     first: Any,
     reach: Any,
@@ -314,6 +236,106 @@ def off_others(
             off = a * (x[k] * reach[k]) + b * (y[k] * reach[k]) + c * (z[k] * reach[k]) - offset
             least = r if first[k] == 2 else (q if first[k] == 1 else p)
             good[k] &= np.int64(off > least)
+
+
+@kernel
+def _met_by_face(
+    beams: Any,
+    size: int,
+    gate_m: float,
+    normals: Any,
+    heights: Any,
+    convex: bool,
+    margins_m: Any,
+    obstacles: Any,
+    gaps_m: Any,
+    first: Any,
+    reach: Any,
+    good: Any,
+    point: Any,
+    who: Any,
+    many: Any,
+) -> None:
+    """Of `size` beams, rays and ranges (4, N), those that end on a face's plane, off the others and what borders them,
+    by face: where they meet it (3, 3, N), which they are (3, N), and how many (3,).
+
+    `first`, `reach` and `good` (N,) are room for what is asked of each beam on the way.
+    """
+    first_met(beams[0], beams[1], beams[2], normals, heights, convex, size, first, reach)
+    _off_others(beams, first, reach, size, gate_m, normals, heights, margins_m, obstacles, gaps_m, good)
+    many[:] = 0
+    for k in range(size):
+        if good[k]:
+            face, expected = first[k], reach[k]
+            at = many[face]
+            for row in range(3):
+                point[face, row, at] = beams[row, k] * expected
+            who[face, at] = k
+            many[face] += 1
+
+
+@kernel
+def faces_met(
+    rays: Any,
+    range_m: Any,
+    gate_m: float,
+    normals: Any,
+    heights: Any,
+    convex: bool,
+    inward: Any,
+    least: Any,
+    starts: Any,
+    margins_m: Any,
+    obstacles: Any,
+    gaps_m: Any,
+) -> Any:
+    """The face (N,) that each return is of, 0 to 2, or -1.
+
+    Parameters
+    ----------
+    rays, range_m : (3, N), (N,)
+        Unit beam directions and measured ranges.
+    gate_m
+        How far a range may be from the one expected.
+    normals, heights
+        The three planes (3, 3), (3,).
+    inward, least, starts
+        All outlines' edges (E, 3), how far along each a point has to lie (E,), and where each outline's begin (4,).
+    margins_m : (3, 3)
+        How far a point of one face has to be from the plane of another.
+    obstacles, gaps_m
+        Planes as normal and offset (B, 4), and how far off them a point of each face has to be (3, B).
+    """
+    found = np.full(len(range_m), -1, np.int8)
+    # Everything is asked of many beams at a time, which vector instructions do together.
+    beams = np.empty((4, _BEAMS))
+    first, reach, good = np.empty(_BEAMS, np.int64), np.empty(_BEAMS), np.empty(_BEAMS, np.int64)
+    point, who, many = np.empty((3, 3, _BEAMS)), np.empty((3, _BEAMS), np.int64), np.empty(3, np.int64)
+    planes, near = (normals, heights, convex), (margins_m, obstacles, gaps_m)
+    for begin in range(0, len(range_m), _BEAMS):
+        size = min(_BEAMS, len(range_m) - begin)
+        for k in range(size):
+            beams[0, k], beams[1, k], beams[2, k] = rays[0, begin + k], rays[1, begin + k], rays[2, begin + k]
+            beams[3, k] = range_m[begin + k]
+        _met_by_face(beams, size, gate_m, *planes, *near, first, reach, good, point, who, many)
+        for face in range(3):
+            inside = far_inside(point[face, :, : many[face]], inward, least, starts[face], starts[face + 1])
+            for at in range(many[face]):
+                if inside[at] > 0.0:
+                    found[begin + who[face, at]] = face
+    return found
+
+
+@kernel
+def outside(rays: Any, normal: Any, height: float, inward: Any, least: Any) -> Any:
+    """Which rays (3, N) to a plane meet it outside of an outline's edges, or on them."""
+    x, y, z = rays[0], rays[1], rays[2]
+    a, b, c = normal[0], normal[1], normal[2]
+    points = np.empty((3, len(x)))
+    for i in range(len(x)):
+        reach = height / (a * x[i] + b * y[i] + c * z[i])
+        points[0, i], points[1, i], points[2, i] = x[i] * reach, y[i] * reach, z[i] * reach
+    return far_inside(points, inward, least, 0, len(least)) <= 0.0
 
 
 @kernel
@@ -358,27 +380,17 @@ def beams_of_faces(
     """
     beams = np.empty((4, _BEAMS))
     first, reach, good = np.empty(_BEAMS, np.int64), np.empty(_BEAMS), np.empty(_BEAMS, np.int64)
-    point, who = np.empty((3, 3, _BEAMS)), np.empty((3, _BEAMS), np.int64)
-    many, total = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    point, who, many = np.empty((3, 3, _BEAMS)), np.empty((3, _BEAMS), np.int64), np.empty(3, np.int64)
+    planes, near = (normals, heights, convex), (margins_m, obstacles, gaps_m)
     of_face, which = np.empty((3, 4, len(points))), np.empty((3, len(points)), np.int64)
-    on_rim = np.empty((3, len(points)), np.bool_)
+    on_rim, total = np.empty((3, len(points)), np.bool_), np.zeros(3, np.int64)
     for begin in range(0, len(points), _BEAMS):
         size = min(_BEAMS, len(points) - begin)
         for k in range(size):
             x, y, z = points[begin + k, 0], points[begin + k, 1], points[begin + k, 2]
             far = np.sqrt(x * x + y * y + z * z)
             beams[0, k], beams[1, k], beams[2, k], beams[3, k] = x / far, y / far, z / far, far
-        first_met(beams[0], beams[1], beams[2], normals, heights, convex, size, first, reach)
-        many[:] = 0
-        off_others(beams, first, reach, size, gate_m, normals, heights, margins_m, obstacles, gaps_m, good)
-        for k in range(size):
-            if good[k]:
-                face, expected = first[k], reach[k]
-                at = many[face]
-                for row in range(3):
-                    point[face, row, at] = beams[row, k] * expected
-                who[face, at] = k
-                many[face] += 1
+        _met_by_face(beams, size, gate_m, *planes, *near, first, reach, good, point, who, many)
         for face in range(3):
             inside = far_inside(point[face, :, : many[face]], inward, least, starts[face], starts[face + 1])
             last = total[face]
