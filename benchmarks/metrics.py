@@ -138,7 +138,7 @@ _FRAMES = (
     " two passes over all returns take half a millisecond each by kernels, the estimate takes one that serves "
     "each frame's corner, a step of the estimate and its noise, and one along the faces' sides; about two fifths "
     "of its time goes into evidence (foreign spots, sides of faces, rings, where beams cross), in many small "
-    "calls on 18 faces. Tried before: frames looked at where they lie in memory that is used again, steps "
+    "calls on 18 faces. Done already: frames looked at where they lie in memory that is used again, steps "
     "lengthened by what weights leave, equations of all faces in one product, a single map of what moved, whole "
     "faces without another search, threads for places and faces, BLAS held to one thread (two took 1.2 to 1.4 "
     "times the processor time). The sightings' own returns in place of a first estimate saved 0.3, but lost one "
