@@ -8,7 +8,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray
+from lidarpose.geometry.compiled import forced
 from lidarpose.model.recording import SweepRecording
 from lidarpose.model.spun_scan import MountingRun
 from lidarpose.refine.mounting_verdict import MountingOptions
@@ -60,7 +62,8 @@ def test_the_room_of_a_rotating_scanner_comes_out_square() -> None:
 
 
 @pytest.mark.slow
-def test_a_corridor_with_lost_sweeps_is_not_called_good() -> None:
+@pytest.mark.parametrize("kernels", [True, False])
+def test_a_corridor_with_lost_sweeps_is_refused_for_them(kernels: bool) -> None:
     recording = corridor()
     # Between two sweeps, half a degree apart by the file, the floor jumps for all beams at once: seen from half a metre
     # above it, its distance grows by what takes 4 degrees and more. No mounting and no factor does that.
@@ -70,11 +73,8 @@ def test_a_corridor_with_lost_sweeps_is_not_called_good() -> None:
     tilt = np.degrees(np.arcsin(height / down[24:30]))
     assert np.abs(np.diff(np.degrees(readings[24:30]))).max() < 0.6
     assert np.abs(np.diff(tilt)).max() > 3.5
-    run = calibrate_by_flatness(recording, axis_in_fan(np.pi / 2.0))
-    assert run.estimate.quality.verdict == "doubtful"
-    assert np.degrees(np.sqrt(np.diag(run.estimate.covariance)[:2])).max() > 0.3
-    # It is found unaided, and so are others.
-    jumps = {jump.sweeps: np.degrees(jump.seen_rad - jump.stated_rad) for jump in run.estimate.jumps}
-    assert jumps[26, 27] == pytest.approx(3.2, abs=0.5)
-    assert len(jumps) >= 3
-    assert any("sweeps were lost" in reason for reason in run.estimate.quality.reasons)
+    # Such jumps are found unaided, and what they move the mounting by leaves it open, whichever surfaces are found.
+    lost = r"the table turned by 3\.\d deg where its readings say 0\.5.* sweeps were lost"
+    start = axis_in_fan(np.pi / 2.0)
+    with forced(kernels), pytest.raises(UndeterminedError, match=lost):
+        calibrate_by_flatness(recording, start)

@@ -11,10 +11,11 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.planes import Plane
 from lidarpose.geometry.se3 import Pose, exp_so3, log_so3
-from lidarpose.model.spun_scan import FlatReturns
-from lidarpose.refine.flatness import N_ALL, SpunState, linearise
+from lidarpose.model.spun_scan import FlatReturns, ReadingJump
+from lidarpose.refine.flatness import N_ALL, SpunState, linearise, solve, start_state
 from lidarpose.refine.mounting import mounting_calibration, refine_mounting
 from lidarpose.refine.mounting_verdict import MountingOptions
+from lidarpose.refine.sweep_turning import moved_by_jumps
 
 # Of a room without a single right angle.
 WALLS = [(0.99, 0.05, 0.1, 3.0), (0.1, 0.98, 0.05, 2.2), (-0.95, 0.2, 0.0, 2.6), (0.1, -0.99, 0.2, 1.9)]
@@ -208,6 +209,29 @@ def test_a_table_that_slips_once_is_named_with_its_place(jump_deg: float) -> Non
     assert any("between sweeps 49 and 50" in reason for reason in estimate.quality.reasons)
     sound = refine_mounting(seen(planes, truth, noise_m=0.005, seed=5, sweeps=120, beams=60), UPRIGHT)
     assert sound.jumps == ()
+
+
+@pytest.mark.parametrize(("jump_deg", "at"), [(0.5, 80), (-2.0, 30), (4.0, 80)])
+def test_what_a_jump_moves_the_mounting_by(jump_deg: float, at: int) -> None:
+    """Predicted where the jump is, and found by estimating without it."""
+    sound = seen(
+        planes_of(WALLS + FLOOR_AND_CEILING),
+        mounted((0.8, -0.6), (0.02, -0.01)),
+        noise_m=0.002,
+        seed=5,
+        sweeps=120,
+        beams=60,
+    )
+    jump = np.radians(jump_deg)
+    slipped = replace(sound, reading_rad=sound.reading_rad - np.where(sound.sweep >= at, jump, 0.0))
+    free = MountingOptions().free
+    there, without = (
+        solve(returns, start_state(returns, UPRIGHT, np.zeros(3), np.pi), free, np.pi) for returns in (slipped, sound)
+    )
+    (moved,) = moved_by_jumps(there, slipped, free, [ReadingJump((at - 1, at), 0.0, jump)])
+    found = errors(without.state.T_table_lidar, there.state.T_table_lidar)
+    np.testing.assert_allclose(moved[:2], found[:2], atol=2e-4)
+    np.testing.assert_allclose(moved[2:], found[2:], atol=5e-4)
 
 
 def test_sweeps_that_changed_places_are_not_called_good() -> None:

@@ -30,12 +30,14 @@ from lidarpose.refine.flatness import (
 )
 from lidarpose.refine.mounting_verdict import IN_WORDS, Findings, MountingOptions, quality_of, slipped
 from lidarpose.refine.reading_jumps import reading_jumps
-from lidarpose.refine.sweep_turning import sweep_turning
+from lidarpose.refine.sweep_turning import moved_by_jumps, sweep_turning
 from lidarpose.refine.turntable_state import regular_motion
 
 # A mounting less certain than this is not known; the estimate may then be anywhere.
 LARGEST_TILT_SIGMA_RAD = np.radians(2.0)
 LARGEST_SHIFT_SIGMA_M = 0.1
+# While surfaces are still looked for, so many times as much: pieces tell less than they will once grown together.
+LARGEST_ON_THE_WAY = 3.0
 # An extra parameter less certain than this is not told by the scene.
 LARGEST_EXTRA_SIGMA = {"encoder_scale": 0.02, "range_offset_m": 0.03, "beam_angle_scale": 0.02}
 # A parameter is missing where it would come to this many standard deviations and take away this share of the squares:
@@ -54,6 +56,8 @@ def refine_mounting(
     origin_rad: float | None = None,
 ) -> MountingEstimate:
     """The mounting at which the surfaces are flattest, with its covariance and a verdict.
+
+    Whether it is told well enough to be a result is for `require_told` to say.
 
     Parameters
     ----------
@@ -86,12 +90,14 @@ def refine_mounting(
     except (np.linalg.LinAlgError, ValueError) as error:
         raise _undetermined("The flat surfaces seen leave the mounting open") from error
     jumps, from_steps = reading_jumps(solution, returns)
-    _refuse_undetermined(covariance, options.estimate, jumps)
+    _refuse_undetermined(covariance, options.estimate, jumps, LARGEST_ON_THE_WAY)
     tested = _extras(solution, evidence, options.estimate, covariance)
     bend = bend_of(solution, returns, solution.line.by_all[:, free])
     by_noise = evidence.covariance(free, widened=False)
     covariance = _covering(covariance, by_noise + bend.covariance)
     covariance = _paid_for(covariance, evidence, free, tested)
+    moved = moved_by_jumps(solution, returns, free, jumps)
+    covariance = covariance + moved.T @ moved
     # A parameter that is missing spoils what else is asked.
     turning = None if any(extra.suggested for extra in tested) else sweep_turning(solution, returns, free)
     if turning is not None and (turning.contradicted or (turning.open and not options.sweeps_stated)):
@@ -144,12 +150,19 @@ def _undetermined(what: str) -> UndeterminedError:
     )
 
 
-def _refuse_undetermined(covariance: FloatArray, estimate: Sequence[str], jumps: Sequence[ReadingJump]) -> None:
+def require_told(estimate: MountingEstimate, options: MountingOptions) -> None:
+    """UndeterminedError where the scene leaves the mounting open, by all that the covariance holds."""
+    _refuse_undetermined(estimate.covariance, options.estimate, estimate.jumps)
+
+
+def _refuse_undetermined(
+    covariance: FloatArray, estimate: Sequence[str], jumps: Sequence[ReadingJump], times: float = 1.0
+) -> None:
     sigma = np.sqrt(np.diag(covariance))
     if not np.all(np.isfinite(sigma)):
         raise _undetermined("The flat surfaces seen leave the mounting open")
     for name, value in zip((n for n in EXTRA_NAMES if n in estimate), sigma[N_MOUNTING:], strict=True):
-        if value > LARGEST_EXTRA_SIGMA[name]:
+        if value > times * LARGEST_EXTRA_SIGMA[name]:
             unit, factor = ("mm", 1e3) if name.endswith("_m") else ("%", 1e2)
             raise UndeterminedError(
                 f"{name} is not told by this scene: its standard deviation would be {factor * value:.2g} {unit}",
@@ -157,7 +170,7 @@ def _refuse_undetermined(covariance: FloatArray, estimate: Sequence[str], jumps:
                 "and more of the turn.",
             )
     tilt, shift = float(sigma[:2].max()), float(sigma[2:4].max())
-    if tilt > LARGEST_TILT_SIGMA_RAD or shift > LARGEST_SHIFT_SIGMA_M:
+    if tilt > times * LARGEST_TILT_SIGMA_RAD or shift > times * LARGEST_SHIFT_SIGMA_M:
         open_ = (
             f"The flat surfaces seen leave the mounting open: standard deviations {np.degrees(tilt):.2g} deg "
             f"and {1e3 * shift:.3g} mm"

@@ -7,12 +7,13 @@ one more parameter; nothing and all of it are the two rigs that exist.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from lidarpose.geometry.arrays import FloatArray, IntArray
-from lidarpose.model.spun_scan import FlatReturns
+from lidarpose.model.spun_scan import FlatReturns, ReadingJump
 from lidarpose.refine.bent_surfaces import bend_of, without_plane
 from lidarpose.refine.flatness import Solution, patches_of
 
@@ -55,17 +56,13 @@ def sweep_turning(solution: Solution, returns: FlatReturns, free: IntArray) -> S
         return None
     line, weight = solution.line, solution.weight
     by = np.column_stack([line.by_all[:, free], line.by_reading * returns.left_out_rad])
-    rows = np.zeros_like(by)
-    root = np.sqrt(weight)[:, None]
-    for k in range(returns.surfaces):
-        mine = np.flatnonzero((returns.surface == k) & (weight > 0.0))
-        rows[mine] = without_plane(root[mine] * by[mine], root[mine] * line.by_plane[mine])
+    rows = _without_planes(solution, returns, by)
     information = rows.T @ rows
     p = len(free)
     along = np.linalg.solve(information[:p, :p], information[:p, p])
     if not information[p, p] - along @ information[:p, p] > 1e-9 * information[p, p]:
         return None
-    pull = rows * (root[:, 0] * line.residual)[:, None]
+    pull = rows * (np.sqrt(weight) * line.residual)[:, None]
     patch, patches = patches_of(returns)
     scores = np.stack([np.bincount(patch, pull[:, j], patches) for j in range(p + 1)], axis=1)
     spread = scores.T @ scores * (patches / max(patches - p - 1 - 3 * returns.surfaces, 1))
@@ -73,3 +70,27 @@ def sweep_turning(solution: Solution, returns: FlatReturns, free: IntArray) -> S
     variance = float((inverse @ spread @ inverse)[p, p] + bend_of(solution, returns, by).covariance[p, p])
     share = float((inverse @ pull.sum(axis=0))[p])
     return SweepTurning(share, float(np.sqrt(variance)), -along)
+
+
+def moved_by_jumps(
+    solution: Solution, returns: FlatReturns, free: IntArray, jumps: Sequence[ReadingJump]
+) -> FloatArray:
+    """What each jump of the readings moves the estimated parameters `free` by (J, p), in one linear step."""
+    if not jumps:
+        return np.zeros((0, len(free)))
+    by_reading = solution.line.by_reading
+    after = [(j.seen_rad - j.stated_rad) * by_reading * (returns.sweep >= j.sweeps[1]) for j in jumps]
+    rows = _without_planes(solution, returns, np.column_stack([solution.line.by_all[:, free], *after]))
+    p = len(free)
+    information = rows[:, :p].T @ rows
+    return np.asarray(-np.linalg.solve(information[:, :p], information[:, p:]).T)
+
+
+def _without_planes(solution: Solution, returns: FlatReturns, by: FloatArray) -> FloatArray:
+    """Weighted derivatives (n, q), without what the planes take up of them."""
+    rows = np.zeros_like(by)
+    root = np.sqrt(solution.weight)[:, None]
+    for k in range(returns.surfaces):
+        mine = np.flatnonzero((returns.surface == k) & (solution.weight > 0.0))
+        rows[mine] = without_plane(root[mine] * by[mine], root[mine] * solution.line.by_plane[mine])
+    return rows

@@ -24,7 +24,7 @@ from lidarpose.model.recording import SweepRecording
 from lidarpose.model.spun_scan import FlatReturns, MountingEstimate, MountingRun, SurfacePoints
 from lidarpose.model.turntable import TurntableMotion
 from lidarpose.refine.flatness import EXTRA_NAMES, points_in_table
-from lidarpose.refine.mounting import mounting_calibration, refine_mounting
+from lidarpose.refine.mounting import mounting_calibration, refine_mounting, require_told
 from lidarpose.refine.mounting_verdict import LARGEST_BEND_FACTOR, MountingOptions
 
 # Enough for a tenth of a millimetre on a wall; a search for planes in more takes its time.
@@ -106,6 +106,7 @@ def calibrate_by_flatness(
     returns = _all_returns(recording)
     origin_rad = 0.5 * float(returns.reading_rad.min() + returns.reading_rad.max())
     estimate, flat, rounds = _settled(returns, T_table_lidar, options, origin_rad, step)
+    require_told(estimate, options)
     if returns.left_out_rad is not None and estimate.quality.figures["bend_factor"] > LARGEST_BEND_FACTOR:
         # Surfaces that bend: perhaps they are flat to a table that moved during the sweeps the other way.
         moved = replace(returns, reading_rad=returns.reading_rad + returns.left_out_rad, left_out_rad=None)
