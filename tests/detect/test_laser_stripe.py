@@ -56,6 +56,19 @@ def test_stripes_lie_where_the_sheet_is(two_panels, shots, finder, azimuth_deg, 
         assert 0.3 < np.median(np.abs(error / points.sigma_px)) < 1.2
 
 
+def test_a_stripe_that_noise_hides_at_first_is_found(two_panels, finder) -> None:
+    """As in dark parts of an image, which a camera's gamma spreads over many grey levels."""
+    rng = np.random.default_rng(4)
+    normal, offset = sheet(84.0, (0.0, 0.013, 1.0))
+    clean = 0.3 * two_panels.stripe(normal, offset, 0.0011) + 0.12 * two_panels.bright()
+    noisy = np.round(np.clip(clean + rng.normal(0.0, 16.0, clean.shape), 0.0, 255.0)).astype(np.uint8)
+    found = finder.find(noisy)
+    assert sorted(found.stripes) == [0, 1]
+    for k, points in found.stripes.items():
+        error = errors(two_panels, two_panels.boards[k], normal, offset, points)
+        assert np.median(np.abs(error / points.sigma_px)) < 1.2
+
+
 @pytest.mark.parametrize("azimuth_deg", [84.0, 5.0])
 def test_rows_and_columns_are_alike(two_panels, shots, finder, azimuth_deg) -> None:
     normal, offset = sheet(azimuth_deg, (-0.09 if azimuth_deg < 45.0 else 0.0, 0.013, 1.0))

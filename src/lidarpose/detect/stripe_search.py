@@ -26,6 +26,8 @@ _VOTE = 256
 _AMBIGUOUS = 0.5
 # A stripe, saturated or not, is narrower than twice this many reduced pixels.
 _RIDGE_REACH = 4
+# Reduced pixels; see `find_line`.
+_SMOOTHING_PX = 1.5
 _NO_LINE = "no stripe on the panel: nothing stands out in a line"
 _ELSEWHERE = "the board is not where the bright images show it: it or the camera was moved"
 _TOO_SHORT = "no stripe on the panel: the only bright line is too short"
@@ -130,6 +132,11 @@ class PanelView:
     def template(self) -> Template:
         """The bright image, reduced, as what stripe images are compared with."""
         return Template.of(self, self.small_bright)
+
+    @cached_property
+    def smooth_template(self) -> Template:
+        """The same for images that are smoothed."""
+        return Template.of(self, _smoothed(self.small_bright))
 
     def grid_at(self, pixels: FloatArray) -> FloatArray:
         """Grid coordinates (..., 2) at pixels (..., 2)."""
@@ -247,6 +254,11 @@ def reduce_image(image: GrayImage | FloatArray, factor: int) -> FloatArray:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
+def _smoothed(image: FloatArray) -> FloatArray:
+    """Where noise is a fifth of what it was, and a stripe keeps most of its height."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), _SMOOTHING_PX))
+
+
 @dataclass(frozen=True, eq=False)
 class CoarseLine:
     """A stripe to a few pixels.
@@ -275,8 +287,16 @@ class CoarseLine:
 
 
 def find_line(view: PanelView, image: GrayImage) -> CoarseLine | str:
-    """The one line of light on the panel, or why there is none, in words."""
-    return _find_in_reduced(view, view.reduced(image), view.template)
+    """The one line of light on the panel, or why there is none, in words.
+
+    What noise hides in dark parts of an image, which a camera's gamma spreads over many grey levels, may show once it
+    is smoothed: the line, and the squares that tell whether the board is where it was.
+    """
+    small = view.reduced(image)
+    found = _find_in_reduced(view, small, view.template)
+    if found in (_NO_LINE, _TOO_SHORT, _ELSEWHERE):
+        return _find_in_reduced(view, _smoothed(small), view.smooth_template)
+    return found
 
 
 def has_line(view: PanelView) -> bool:
