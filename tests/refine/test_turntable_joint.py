@@ -338,6 +338,20 @@ def test_an_effect_that_is_named_but_not_estimated_is_in_the_covariance(blunders
     assert sigma < 5.0 * np.sqrt(np.mean([e[0] ** 2 for e in inside]))
 
 
+@pytest.mark.parametrize("scale", [1.0, 1.01])
+def test_a_scale_that_the_data_cannot_tell_is_said(scale: float) -> None:
+    rig = draw_rig(2, places=4, step_deg=3.0)
+    observations = simulate_observations(rig, stripe_step_px=20.0, seed=3)
+    places = [
+        replace(p, scan_lines={k: replace(s, range_m=scale * s.range_m) for k, s in p.scan_lines.items()})
+        for p in observations.places
+    ]
+    estimate = refine(rig, replace(observations, places=tuple(places)))
+    extra = {e.name: e for e in estimate.extras}["range_scale"]
+    assert not extra.observable or abs(extra.value) < 3.5 * extra.sigma
+    assert any("do not show whether the ranges are true" in reason for reason in estimate.quality.reasons)
+
+
 def test_a_sound_session_pays_for_no_effect() -> None:
     rig = draw_rig(2, places=20)
     estimate = refine(rig, simulate_observations(rig, stripe_step_px=20.0, seed=3))

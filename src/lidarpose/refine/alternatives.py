@@ -16,6 +16,7 @@ from lidarpose.model.observation import PanelCorners, PlaceObservation, ScanLine
 from lidarpose.model.turntable_result import Kind
 from lidarpose.refine.joint_equations import lines_of
 from lidarpose.refine.joint_options import JointOptions
+from lidarpose.refine.turntable_estimate import outside_parameters, require_determined
 from lidarpose.refine.turntable_joint import Solution, solve_joint
 from lidarpose.refine.turntable_layout import lay_out
 from lidarpose.refine.turntable_state import start_state
@@ -56,7 +57,10 @@ def misfit(solution: Solution) -> float:
 
 
 def explain_by_alternative(observations: TurntableObservations, options: JointOptions) -> str | None:
-    """The alternative that removes a contradiction, in words; None where none does or no restart was given."""
+    """The alternative that removes a contradiction, in words; None where none does or no restart was given.
+
+    It has to determine the pose: what leaves it open fits too easily.
+    """
     if options.restart is None:
         return None
     part = thinned_observations(observations)
@@ -80,9 +84,17 @@ def _try(observations: TurntableObservations, options: JointOptions) -> tuple[fl
         solution = solve_joint(
             data, start_state(data, motion, panels), replace(options, estimate=(), max_iterations=20)
         )
+        return misfit(solution), solution.converged and _sound(solution) and _is_determined(solution)
     except (UndeterminedError, ValueError, np.linalg.LinAlgError):
         return None
-    return misfit(solution), solution.converged and _sound(solution)
+
+
+def _is_determined(solution: Solution) -> bool:
+    try:
+        require_determined(solution, outside_parameters(solution))
+    except UndeterminedError:
+        return False
+    return True
 
 
 _SOUND: dict[Kind, float] = {"stripes": 0.5, "ranges": 0.004}

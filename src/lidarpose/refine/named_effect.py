@@ -21,7 +21,7 @@ from lidarpose.model.turntable_result import ExtraParameter
 from lidarpose.refine.contradictions import Explanation
 from lidarpose.refine.joint_options import JointOptions
 from lidarpose.refine.observability import PoseSpread
-from lidarpose.refine.turntable_estimate import OutsideParameters, move_of_extra
+from lidarpose.refine.turntable_estimate import OutsideParameters, extra_effect, move_of_extra
 from lidarpose.refine.turntable_joint import Solution
 
 EXTRA_WORDS: dict[str, str] = {
@@ -45,6 +45,9 @@ _TOLERATED: dict[str, float] = {
     "centre_y_px": 8.0,
 }
 _SURE = 5.0
+_SURE_OF_LARGE = 3.5
+"""An effect beyond what is tolerated shifts the pose by far more than noise does: one that chance makes in one session
+of two hundred (eight are looked for) is sooner real."""
 _SEARCH_PRICE = {"moved-board": 8.0, "slip": 8.0}
 _NEARLY_AS_GOOD = 20.0
 """Falls of the weighted sum of squares that differ by less (a likelihood ratio of 22 000) do not settle which it is."""
@@ -115,13 +118,33 @@ def shift_of(outside: OutsideParameters, effect: NamedEffect, reading_rad: float
     return float(np.linalg.norm(xi[:3] + np.cross(xi[3:], centre))), float(np.linalg.norm(xi[3:]))
 
 
+def unseen_range_errors(
+    solution: Solution, outside: OutsideParameters, extras: Sequence[ExtraParameter], want_mm: float
+) -> str | None:
+    """Systematic errors of the ranges that would move the pose by more than is wanted and leave no mark, in words."""
+    found = []
+    for extra in extras:
+        amount = _TOLERATED[extra.name]
+        seen = extra.estimated or (extra.observable and _SURE_OF_LARGE * extra.sigma < amount)
+        if seen or extra.name not in ("range_offset_m", "range_scale"):
+            continue
+        shift_mm = 1e3 * extra_effect(solution, outside, extra.name, amount)[0]
+        if shift_mm > want_mm:
+            by = f"{1e3 * amount:.0f} mm" if extra.name == "range_offset_m" else f"{100 * amount:.1f} %"
+            found.append(f"were they all too long by {by}, the pose would move by {shift_mm:.1f} mm")
+    if not found:
+        return None
+    return f"these data do not show whether the ranges are true: {', and '.join(found)}"
+
+
 def _from_extras(
     solution: Solution, outside: OutsideParameters, extras: Sequence[ExtraParameter]
 ) -> Iterator[tuple[float, NamedEffect]]:
     for extra in extras:
-        if extra.estimated or not extra.observable or abs(extra.value) <= _SURE * extra.sigma:
-            continue
         large = abs(extra.value) > _TOLERATED[extra.name]
+        sure = _SURE_OF_LARGE if large else _SURE
+        if extra.estimated or not extra.observable or abs(extra.value) <= sure * extra.sigma:
+            continue
         if not large and not extra.suggested:
             continue
         text = f"{EXTRA_WORDS[extra.name]}: {describe_extra(extra)}{_mirror_hint(extra, solution)}"

@@ -17,7 +17,7 @@ from lidarpose.refine.alternatives import duplicates, explain_by_alternative
 from lidarpose.refine.contradictions import explanations
 from lidarpose.refine.hit_squares import with_squares
 from lidarpose.refine.joint_options import JointOptions
-from lidarpose.refine.named_effect import paid_for, shift_of, strongest_effects, suggested
+from lidarpose.refine.named_effect import paid_for, shift_of, strongest_effects, suggested, unseen_range_errors
 from lidarpose.refine.observability import pose_spread, weak_directions, whole_turn
 from lidarpose.refine.stability import leave_places_out
 from lidarpose.refine.turntable_estimate import (
@@ -173,6 +173,7 @@ def _assemble(
         duplicates=duplicates(observations),
         drift=(solution.suspicious or solution).drift,
         effects=effects,
+        unseen=unseen_range_errors(solution, outside, extras, options.want_mm),
         effect_shift=shift_of(outside, effects[0], data.reference_rad) if effects else (0.0, 0.0),
     )
     quality = judge(evidence)

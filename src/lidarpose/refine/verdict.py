@@ -47,6 +47,7 @@ class Evidence:
     drift: Drift | None = None
     effects: Sequence[NamedEffect] = ()
     effect_shift: tuple[float, float] = (0.0, 0.0)
+    unseen: str | None = None
 
 
 class _Judge:
@@ -79,6 +80,8 @@ def judge(evidence: Evidence) -> Quality:
     _judge_drift(jury, evidence)
     _judge_size(jury, evidence)
     _judge_stability(jury, evidence)
+    if evidence.unseen is not None and not evidence.effects:
+        jury.note(f"note: {evidence.unseen}")
     return Quality(_ORDER[jury.level], tuple(jury.reasons), _figures(evidence))
 
 
