@@ -12,7 +12,7 @@ from lidarpose.model.session import ScanSource
 from lidarpose.simulate.corruption import Mistake, corrupt
 from lidarpose.simulate.rig import draw_rig
 from lidarpose.simulate.session import SimulatedSession, simulate_session
-from lidarpose.workflows.named_causes import with_cause_named
+from lidarpose.workflows.named_causes import stands_still, with_cause_named
 from lidarpose.workflows.reversed_scans import Solved
 from lidarpose.workflows.turntable import _doubt_order, calibrate_turntable, detect_features
 
@@ -34,6 +34,15 @@ def simulated() -> SimulatedSession:
 def test_the_mistake_is_named(simulated: SimulatedSession, mistake: Mistake, words: str) -> None:
     with pytest.raises(UndeterminedError, match=words):
         calibrate_turntable(corrupt(simulated, mistake))
+
+
+def test_a_stripe_that_stays_on_a_table_that_turns_is_no_table_that_stands_still(simulated: SimulatedSession) -> None:
+    first = detect_features(simulated.session).places[0]
+    turned = 0.1
+    lines = tuple(replace(line, angle_rad=line.angle_rad - turned) for line in first.lines)
+    later = replace(first, turntable_angle_rad=first.turntable_angle_rad + turned)
+    assert stands_still([first, later])
+    assert not stands_still([first, replace(later, lines=lines)])
 
 
 @dataclass(frozen=True)

@@ -117,15 +117,19 @@ def _widest_scan_deg(session: TurntableSession) -> float:
 
 
 def stands_still(places: Places) -> bool:
-    """Whether all stripes lie at the same place although the readings differ."""
-    lit = [place for place in places if place.stripes]
+    """Whether all stripes lie at the same place, and the scans' lines too, although the readings differ."""
+    lit = sorted((place for place in places if place.stripes), key=lambda place: place.turntable_angle_rad)
     if len(lit) < 2 or np.ptp([place.turntable_angle_rad for place in lit]) < _TURNED_RAD:
         return False
     for panel in {k for place in lit for k in place.stripes}:
         middles = np.array([np.median(p.stripes[panel].pixels, axis=0) for p in lit if panel in p.stripes])
         if np.ptp(middles, axis=0).max() > _STILL_PX:
             return False
-    return True
+    # Where the table's axis is square to the scan plane, the stripe stays although the table turns.
+    first, last = (np.array([line.angle_rad.mean() for line in lit[k].lines]) for k in (0, -1))
+    if len(first) == 0 or len(last) == 0:
+        return True
+    return bool(np.median(np.abs(first[:, None] - last).min(axis=1)) < _TURNED_RAD)
 
 
 def _fits(places: Places, assign: Callable[[Places], Tried], most_sigmas: float) -> bool:
