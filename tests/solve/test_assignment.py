@@ -198,6 +198,26 @@ def panel_of_the_first_line(places: tuple[PlaceObservation, ...]) -> set[int]:
     return {int(p.scan_lines[0].angle_rad.mean() > p.scan_lines[1].angle_rad.mean()) for p in places}
 
 
+def test_three_places_whose_lines_have_lost_most_of_themselves_are_enough() -> None:
+    rig = draw_rig(6, places=3)
+    observations = simulate_observations(rig, stripe_step_px=6.0, seed=2)
+    poses = {name: board_poses(observations.camera, c, name) for name, c in observations.corners.items()}
+    places = [
+        PlaceFeatures(
+            p.position,
+            p.turntable_angle_rad,
+            p.stripes,
+            tuple(part_of(line, 0, int(0.35 * len(line))) for line in p.scan_lines.values()),
+            p.placement,
+        )
+        for p in observations.places
+    ]
+    truth = panel_of_the_first_line(observations.places)
+    found = assign(observations.camera, poses, places, first_panel=min(truth))
+    assert len(found.places) == 3
+    assert panel_of_the_first_line(found.places) == truth
+
+
 @pytest.mark.parametrize("noise", [1.0, 2.0, 3.0])
 def test_broken_lines_over_a_short_arc_are_assigned_rightly_or_refused_and_the_hint_helps(noise: float) -> None:
     outcomes = []
