@@ -1,6 +1,7 @@
 """Work shared by threads."""
 
 import threading
+from queue import Empty
 
 import numpy as np
 import pytest
@@ -14,6 +15,22 @@ def test_results_come_in_order_and_errors_come_through(elements: int) -> None:
     assert threads.each(lambda k: k, [], elements) == []
     with pytest.raises(ZeroDivisionError):
         threads.each(lambda k: 1 // (3 - k), range(7), elements)
+
+
+@pytest.mark.parametrize("first", [ValueError, Empty])
+def test_of_several_errors_the_first_items_comes_through(monkeypatch: pytest.MonkeyPatch, first: type) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    later = threading.Event()
+
+    def fail(k: int) -> None:
+        if k == 0:
+            later.wait(10.0)
+            raise first
+        later.set()
+        raise KeyError(k)
+
+    with pytest.raises(first):
+        threads.each(fail, range(4), threads.LARGE)
 
 
 def test_small_work_stays_in_its_thread() -> None:

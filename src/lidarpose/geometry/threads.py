@@ -6,7 +6,7 @@ import ctypes
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -24,27 +24,36 @@ Result = TypeVar("Result")
 def each(work: Callable[[Item], Result], items: Sequence[Item], elements: int) -> list[Result]:
     """What `work` makes of each item, in order; in threads, where an item's arrays have many `elements`.
 
-    Whoever asks works as well: a thread less to start, and to change over to.
+    Whoever asks works as well: a thread less to start, and to change over to. An error is that of the first item, in
+    their order, of which there is any.
     """
     cores = min(os.cpu_count() or 1, len(items))
     if cores < 2 or elements < LARGE:
         return [work(item) for item in items]
     made: dict[int, Result] = {}
+    failed: dict[int, Exception] = {}
     left: SimpleQueue[int] = SimpleQueue()
     for k in range(len(items)):
         left.put(k)
 
     def some() -> None:
-        with suppress(Empty):
-            while True:
+        while not failed:
+            try:
                 k = left.get_nowait()
+            except Empty:
+                return
+            try:
                 made[k] = work(items[k])
+            except Exception as error:
+                failed[k] = error
 
     with ThreadPoolExecutor(cores - 1) as pool:
         others = [pool.submit(some) for _ in range(cores - 1)]
         some()
     for other in others:
         other.result()
+    if failed:
+        raise failed[min(failed)]
     return [made[k] for k in range(len(items))]
 
 
