@@ -279,7 +279,7 @@ def test_three_places_in_a_slanted_plane_that_turn_the_sensor_over_are_doubted()
 
 def test_a_target_that_stands_still_is_no_answer(simulated: Simulated) -> None:
     session, _, _ = simulated
-    still = tuple(replace(p, clouds=session.places[0].clouds) for p in session.places)
+    still = tuple(replace(p, clouds=session.places[0].clouds[:1]) for p in session.places[:3])
     with pytest.raises(UndeterminedError, match="no corner"):
         calibrate_world(replace(session, places=still))
 
