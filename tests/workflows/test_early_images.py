@@ -14,8 +14,10 @@ from lidarpose.workflows.early_images import EarlyImages
 from lidarpose.workflows.forked import copies_allowed, share
 
 
-@dataclass(eq=False)
+@dataclass
 class Source:
+    """Not to be hashed, as any source may be."""
+
     image: GrayImage | None
     name: str = "image"
     asked: list[None] = field(default_factory=list)

@@ -27,7 +27,7 @@ class EarlyImages:
         self._shape, self._size = shape, shape[0] * shape[1]
         self._sources = sources[: min(MOST, MOST_BYTES // self._size)]
         self._memory = mmap.mmap(-1, max(len(self) * self._size, 1))  # shared with copies, and in no file
-        self._there: dict[ImageSource, int] = {}
+        self._there: dict[int, int] = {}  # by id: sources of others need not be hashable
 
     def __len__(self) -> int:
         return len(self._sources)
@@ -42,11 +42,11 @@ class EarlyImages:
 
     def keep(self, decoded: Sequence[bool]) -> None:
         """What `decode` has answered, whoever was asked."""
-        self._there = {source: k for k, source in enumerate(self._sources) if decoded[k]}
+        self._there = {id(source): k for k, source in enumerate(self._sources) if decoded[k]}
 
     def load(self, source: ImageSource) -> GrayImage:
         """An image, decoded before or now."""
-        k = self._there.get(source)
+        k = self._there.get(id(source))
         return source.load() if k is None else self._place(k)
 
     def _place(self, k: int) -> GrayImage:
