@@ -24,7 +24,8 @@ import numpy as np
 
 from lidarpose.detect.albedo import measure_albedo
 from lidarpose.detect.chessboard import BoardDetection
-from lidarpose.detect.stripe_fit import StripeFit, fit_stripes
+from lidarpose.detect.stripe_fit import fit_stripes
+from lidarpose.detect.stripe_points import StripeFit
 from lidarpose.detect.stripe_search import KERNELS, CoarseLine, PanelView, find_line, has_line
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.compiled import pays

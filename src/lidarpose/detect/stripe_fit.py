@@ -13,10 +13,9 @@ The images of one panel are fitted several at once: see `stripe_bands` for the t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidarpose.detect.stripe_bands import (
     Bands,
@@ -24,104 +23,36 @@ from lidarpose.detect.stripe_bands import (
     Powers,
     Ranges,
     Source,
-    as_pixels,
     bands_about,
     cut,
     distance_from,
     fit_curves,
     for_table,
     look_at_albedo,
-    quantile,
     quantiles,
-    spreads,
     usable_ranges,
 )
 from lidarpose.detect.stripe_noise import NOISE_SAMPLES, Samples, learn_noise
+from lidarpose.detect.stripe_points import MIN_POINTS, State, StripeFit, merged, smoothed
 from lidarpose.detect.stripe_search import KERNELS, CoarseLine, PanelView
-from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
+from lidarpose.geometry.arrays import BoolArray, FloatArray
 from lidarpose.geometry.compiled import pays
-from lidarpose.geometry.robust import MAD_TO_SIGMA, tukey_weights
 from lidarpose.model.image import GrayImage
-from lidarpose.model.observation import StripePoints
 
-# Profiles that are merged into one point (half as many in short stripes): neighbours share the lens's blur and the
-# laser's speckle.
-_BLOCK = 8
-_SHORT = 300
-_MIN_POINTS = 8
 # Half-height of the band in which the coarse line is made fine, pixels.
 _FIRST_HALF = 12
 # Pixels further from the stripe than this, in widths, show what is beside it.
 _BESIDE = 2.7
-# A profile, or a point, whose centre is worse than this tells nothing.
-_WORST_SIGMA_PX = 0.8
 # Profiles without light keep to the curve by this pull, nothing against a real profile's hundredths.
 _PULL_PX = 1.5
-# What the squares' edges and the blur are known to at best, in what they move a point by.
-_MODEL_SIGMA_PX = 0.01
-# By what the noise of pixels may be off, and how often the part that all points share is halved.
-_NOISE_FACTORS, _HALVINGS = np.array([[1.0], [1.25], [1.5], [1.75], [2.0], [2.5]]), 8
 # A step that changes the width by this share and the typical centre by so many of its sigmas is the last one.
 _SETTLED_WIDTH, _SETTLED_SIGMAS, _MOST_STEPS = 0.04, 1.5, 6
 # Order of the unknowns: the first three are each profile's own, the width is common.
 _BACKGROUND, _HEIGHT, _CENTRE, _WIDTH = range(4)
 
 
-@dataclass(frozen=True, eq=False)
-class StripeFit:
-    """Points, and what the fit learnt on the way (for tests and reports).
-
-    Attributes
-    ----------
-    width_px
-        Standard deviation of the stripe's profile across, lens included.
-    dark_ratio
-        Light sent back by dark squares against light ones, at the laser's colour.
-    inflation
-        By how much the scatter about a smooth curve exceeds what the noise explains (1: not at all); the points'
-        standard deviations are those that explain it.
-    """
-
-    points: StripePoints
-    width_px: float
-    dark_ratio: float
-    inflation: float
-
-
 _NO_RANGE = "no stripe on the panel: the bright line leaves the squares"
 _NO_RIDGE = "no stripe on the panel: the bright line is not a narrow ridge"
-_TOO_FEW = "no stripe on the panel: too few profiles show it"
-_TOO_ROUGH = "no usable stripe on the panel: what there is of it is too faint and rough to tell where it runs"
-_NOT_NARROW = "the bright line on the panel is not the narrow straight line that a laser makes"
-# `stripe_profile_kernels` counts them so too.
-_PROBLEMS = ("", _TOO_FEW, _NOT_NARROW, _TOO_ROUGH)
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """height, centre, background : (B, N); width, dark_ratio : (B,); noise : (B, 3); information : (B, N) on the
-    centre, 1 / px^2 along v."""
-
-    height: FloatArray
-    centre: FloatArray
-    background: FloatArray
-    width: FloatArray
-    dark_ratio: FloatArray
-    noise: FloatArray
-    information: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Smooth:
-    """Smooth curves through the centres, the weight (B, N) that each profile is left with, and its residual (B, N).
-
-    `problems` (B,) are why a band shows no stripe: which of `_PROBLEMS`, 0 where it does.
-    """
-
-    curves: Curves
-    weight: FloatArray
-    residual: FloatArray
-    problems: IntArray
 
 
 def fit_stripes(
@@ -150,7 +81,7 @@ def _fit_alike(source: Source, lines: Sequence[CoarseLine]) -> list[StripeFit | 
         np.array([[line.intercept, line.slope] for line in lines]), np.zeros((len(lines), 1)), np.ones((len(lines), 1))
     )
     ranges = usable_ranges(source.view, lines, straight)
-    long_enough = ranges.valid.sum(axis=1) >= _MIN_POINTS
+    long_enough = ranges.valid.sum(axis=1) >= MIN_POINTS
     alive = np.flatnonzero(long_enough)
     if len(alive) == 0:
         return found
@@ -177,16 +108,16 @@ def _fit_near(source: Source, ranges: Ranges, few: Ranges, curves: Curves, width
     bands = look_at_albedo(bands_about(source, few, curves, width), source, curves, width)
     state = _start(bands, curves, width, np.full(len(width), ratio), None)
     state = _settle(bands, state, curves, learn_at=0, least=1)
-    curves, ratios = _smooth(bands, state).curves, _dark_ratios(bands, state)
+    curves, ratios = smoothed(bands, state).curves, _dark_ratios(bands, state)
     bands = look_at_albedo(bands_about(source, ranges, curves, state.width), source, curves, state.width)
     state = _start(bands, curves, state.width, ratios, state.noise)
     state = _settle(bands, state, curves, learn_at=1, least=2)
-    smooth = _smooth(bands, state)
+    smooth = smoothed(bands, state)
     state = replace(state, dark_ratio=_dark_ratios(bands, state))
-    return _merged(bands, smooth, source.steep, state)
+    return merged(bands, smooth, source.steep, state)
 
 
-def _settle(bands: Bands, state: _State, curves: Curves, *, learn_at: int, least: int) -> _State:
+def _settle(bands: Bands, state: State, curves: Curves, *, learn_at: int, least: int) -> State:
     """Steps until each band's width and centres stay; the noise is learnt from what is left before step `learn_at`.
 
     Two steps do for most; it is saturated stripes, of which only the skirts are seen, that take more. A band that has
@@ -206,11 +137,11 @@ def _settle(bands: Bands, state: _State, curves: Curves, *, learn_at: int, least
     return state
 
 
-def _settle_compiled(bands: Bands, state: _State, curves: Curves, *, learn_at: int, least: int) -> _State:
+def _settle_compiled(bands: Bands, state: State, curves: Curves, *, learn_at: int, least: int) -> State:
     """`_settle` by kernels."""
     from lidarpose.detect import stripe_profile_kernels
 
-    state = _State(**{entry.name: np.array(getattr(state, entry.name), dtype=np.float64) for entry in fields(_State)})
+    state = State(**{entry.name: np.array(getattr(state, entry.name), dtype=np.float64) for entry in fields(State)})
     unknowns = (state.height, state.centre, state.background, state.width, state.information)
     pull = (curves.at(bands.u), 1.0 / _PULL_PX**2, _SETTLED_SIGMAS, _SETTLED_WIDTH)
     moving = np.ones(len(state.width), dtype=bool)
@@ -223,20 +154,20 @@ def _settle_compiled(bands: Bands, state: _State, curves: Curves, *, learn_at: i
     return state
 
 
-def _has_settled(bands: Bands, before: _State, after: _State) -> BoolArray:
+def _has_settled(bands: Bands, before: State, after: State) -> BoolArray:
     """Whether the last step (B,) was so small that the next one would not matter."""
     moved = np.abs(after.centre - before.centre) * np.sqrt(after.information)
     small = quantiles(moved, bands.valid, 0.5) < _SETTLED_SIGMAS
     return np.asarray(small & (np.abs(np.log(after.width / before.width)) < _SETTLED_WIDTH))
 
 
-def _chosen(which: BoolArray, a: _State, b: _State) -> _State:
+def _chosen(which: BoolArray, a: State, b: State) -> State:
     """`a` for the bands in `which`, `b` for the others."""
     found = {}
-    for entry in fields(_State):
+    for entry in fields(State):
         x, y = getattr(a, entry.name), getattr(b, entry.name)
         found[entry.name] = np.where(which if x.ndim == 1 else which[:, None], x, y)
-    return _State(**found)
+    return State(**found)
 
 
 def _first_curves(bands: Bands, share: FloatArray, straight: Curves) -> tuple[Curves, FloatArray, BoolArray]:
@@ -256,7 +187,7 @@ def _first_curves(bands: Bands, share: FloatArray, straight: Curves) -> tuple[Cu
     near, is_ridge, curves = strong, np.ones(len(v), dtype=bool), straight
     for reach in (8.0, 4.0, 2.5):
         near = strong & (np.abs(v - curves.at(bands.u)) <= reach)
-        is_ridge &= np.count_nonzero(near, axis=1) >= _MIN_POINTS
+        is_ridge &= np.count_nonzero(near, axis=1) >= MIN_POINTS
         curves = fit_curves(powers, v, near.astype(np.float64))
     window = np.clip(peak + np.arange(-9, 10)[:, None, None], 0, len(rest) - 1)
     area = np.maximum(np.take_along_axis(rest, window, axis=0), 0.0).sum(axis=0) / np.maximum(height, 1e-3)
@@ -273,11 +204,11 @@ def _first_curves_compiled(bands: Bands, share: FloatArray, straight: Curves) ->
     found = np.empty((len(share), 7))
     tables = (bands.values, bands.bright, np.asarray(share, dtype=np.float32))
     profiles = (bands.v[0], bands.u, bands.valid, straight.at(bands.u))
-    stripe_profile_kernels.first_curves(*tables, *profiles, _MIN_POINTS, found)
+    stripe_profile_kernels.first_curves(*tables, *profiles, MIN_POINTS, found)
     return Curves(found[:, :3], found[:, 3:4], found[:, 4:5]), found[:, 5], found[:, 6] > 0.0
 
 
-def _start(bands: Bands, curves: Curves, width: FloatArray, ratio: FloatArray, noise: FloatArray | None) -> _State:
+def _start(bands: Bands, curves: Curves, width: FloatArray, ratio: FloatArray, noise: FloatArray | None) -> State:
     """Heights and backgrounds by least squares with all else as given; a guess of the noise from the pixels beside."""
     centre = curves.at(bands.u)
     if pays(0.0, KERNELS):
@@ -292,7 +223,7 @@ def _start(bands: Bands, curves: Curves, width: FloatArray, ratio: FloatArray, n
         rest = np.abs(bands.values - for_table(background)) * flank
         rest_sum, count = (x.sum(axis=0).sum(axis=1, dtype=np.float64) for x in (rest, flank))
         noise = _first_noise(rest_sum / np.maximum(count, 1.0))
-    return _State(height, centre, background, width, ratio, noise, np.ones_like(centre))
+    return State(height, centre, background, width, ratio, noise, np.ones_like(centre))
 
 
 def _first_noise(distance: FloatArray) -> FloatArray:
@@ -312,7 +243,7 @@ def _start_sums(bands: Bands, distance: FloatArray, ratio: FloatArray) -> Sequen
 
 def _start_compiled(
     bands: Bands, centre: FloatArray, width: FloatArray, ratio: FloatArray, noise: FloatArray | None
-) -> _State:
+) -> State:
     """`_start` by kernels."""
     from lidarpose.detect import stripe_kernels
 
@@ -325,7 +256,7 @@ def _start_compiled(
         profiles = (background, for_table(centre), for_table(bands.cosine), np.asarray(1.0 / width, dtype=np.float32))
         stripe_kernels.beside(bands.v, bands.values, bands.good, *profiles, np.float32(_BESIDE), distance)
         noise = _first_noise(distance)
-    return _State(height, centre, background, width, ratio, noise, np.ones_like(centre))
+    return State(height, centre, background, width, ratio, noise, np.ones_like(centre))
 
 
 def _bell_compiled(bands: Bands, centre: FloatArray, width: FloatArray) -> FloatArray:
@@ -338,7 +269,7 @@ def _bell_compiled(bands: Bands, centre: FloatArray, width: FloatArray) -> Float
     return np.exp(bell, out=bell)
 
 
-def _step(bands: Bands, state: _State, curves: Curves, *, learn: bool) -> _State:
+def _step(bands: Bands, state: State, curves: Curves, *, learn: bool) -> State:
     """One Gauss-Newton step; with `learn`, the noise is learnt again first."""
     M, noise = _equations(bands, state, learn=learn)
     M[_BACKGROUND][0] += 1e-9
@@ -346,7 +277,7 @@ def _step(bands: Bands, state: _State, curves: Curves, *, learn: bool) -> _State
     M[_CENTRE][0] += 1.0 / _PULL_PX**2
     M[_CENTRE][-1] += (curves.at(bands.u) - state.centre) / _PULL_PX**2
     change, by_width, information = _solve(M)
-    return _State(
+    return State(
         np.maximum(state.height + change[_HEIGHT], 1e-3),
         state.centre + np.clip(change[_CENTRE], -1.0, 1.0),
         state.background + change[_BACKGROUND],
@@ -357,7 +288,7 @@ def _step(bands: Bands, state: _State, curves: Curves, *, learn: bool) -> _State
     )
 
 
-def _equations(bands: Bands, state: _State, *, learn: bool) -> tuple[list[FloatArray], FloatArray]:
+def _equations(bands: Bands, state: State, *, learn: bool) -> tuple[list[FloatArray], FloatArray]:
     """`_normal_equations` of the next step, and the noise (B, 3) that its weights are for."""
     distance = distance_from(bands, state.centre) * for_table(1.0 / state.width)
     squared = distance * distance
@@ -381,7 +312,7 @@ def _equations(bands: Bands, state: _State, *, learn: bool) -> tuple[list[FloatA
     return _normal_equations(J, residual, weight), noise
 
 
-def _sums_compiled(bands: Bands, state: _State, *, learn: bool) -> tuple[FloatArray, FloatArray]:
+def _sums_compiled(bands: Bands, state: State, *, learn: bool) -> tuple[FloatArray, FloatArray]:
     """The sums of `_normal_equations` (14, B, N), one row after the other, and the noise (B, 3), by kernels."""
     from lidarpose.detect import stripe_kernels
 
@@ -399,7 +330,7 @@ def _sums_compiled(bands: Bands, state: _State, *, learn: bool) -> tuple[FloatAr
     return rows, noise
 
 
-def _samples(bands: Bands, state: _State, bell: FloatArray) -> Samples:
+def _samples(bands: Bands, state: State, bell: FloatArray) -> Samples:
     """Residual, level and signal of some pixels of each band, as `_equations` has them of all, by kernels."""
     from lidarpose.detect import stripe_kernels
 
@@ -442,7 +373,7 @@ def _solve(rows: list[FloatArray]) -> tuple[list[FloatArray], FloatArray, FloatA
     return changes, by_width, np.asarray(rows[_CENTRE][0])
 
 
-def _dark_ratios(bands: Bands, state: _State) -> FloatArray:
+def _dark_ratios(bands: Bands, state: State) -> FloatArray:
     """Light (B,) that dark squares send back against light ones, at the laser's colour: from the profiles wholly on
     either.
 
@@ -454,128 +385,3 @@ def _dark_ratios(bands: Bands, state: _State) -> FloatArray:
     light, dark = (quantiles(state.height, which, 0.5) for which in (on_light, on_dark))
     seen = state.dark_ratio * np.where(enough, dark, 1.0) / np.where(enough, light, 1.0)
     return np.where(enough, np.clip(seen, 0.01, 1.0), state.dark_ratio)
-
-
-def _smooth(bands: Bands, state: _State) -> _Smooth:
-    """Smooth curves through the centres, robust against the profiles that show something else."""
-    if pays(0.0, KERNELS):
-        return _smooth_compiled(bands, state)
-    sigma = 1.0 / np.sqrt(state.information)
-    known = bands.valid & (sigma * bands.cosine < _WORST_SIGMA_PX)
-    weight = np.where(known, state.information, 0.0)
-    robust = weight
-    cubic = np.count_nonzero(known, axis=1) > 60
-    enough = np.ones(len(sigma), dtype=bool)
-    powers = Powers.of(bands, 3)
-    for _ in range(3):
-        enough &= np.count_nonzero(robust, axis=1) >= _MIN_POINTS
-        curves = fit_curves(powers, state.centre, robust, cubic)
-        residual = state.centre - curves.at(bands.u)
-        standardised = residual / sigma
-        scale = np.maximum(np.where(enough, spreads(standardised, known), 1.0), 1.0)[:, None]
-        robust = weight * tukey_weights(standardised / scale)
-    kept = np.where(np.abs(standardised) < 4.0 * scale, weight, 0.0)
-    narrow = spreads(residual * bands.cosine, kept > 0) < 0.5 * np.maximum(state.width, 1.0)
-    return _Smooth(curves, kept, residual, np.where(enough, np.where(narrow, 0, 2), 1))
-
-
-def _smooth_compiled(bands: Bands, state: _State) -> _Smooth:
-    """`_smooth` by kernels."""
-    from lidarpose.detect import stripe_profile_kernels
-
-    curves, problems = np.empty((len(state.width), 6)), np.empty(len(state.width), np.int64)
-    kept, residual = np.empty_like(state.centre), np.empty_like(state.centre)
-    profiles = (bands.u, bands.valid, state.centre, state.information, bands.cosine, state.width)
-    stripe_profile_kernels.smooth(*profiles, _WORST_SIGMA_PX, _MIN_POINTS, curves, kept, residual, problems)
-    return _Smooth(Curves(curves[:, :4], curves[:, 4:5], curves[:, 5:6]), kept, residual, problems)
-
-
-def _stated_sigma(offset: FloatArray, sigma: FloatArray) -> NDArray[np.float64]:
-    """What points' offsets (n,) from the curve say their standard deviations are: that of their pixels' noise, times a
-    factor, beside a part that all share.
-
-    Speckle that the lens has smeared over neighbours moves strong and faint points by the same; a factor alone would
-    state strong points too well and faint ones too badly. The likelier of some factors, each with its shared part.
-    """
-    scaled = _NOISE_FACTORS * sigma
-    far = np.abs(offset)
-    middle = int(0.5 * (len(offset) - 1))
-
-    def spread(sigmas: FloatArray) -> FloatArray:
-        return MAD_TO_SIGMA * np.partition(far / sigmas, middle, axis=1)[:, middle : middle + 1]
-
-    # The shared part with which each factor's spread is 1, by halving what it lies between.
-    low, high = np.zeros((len(scaled), 1)), np.full((len(scaled), 1), MAD_TO_SIGMA * quantile(far, 0.5))
-    for _ in range(_HALVINGS):
-        between = 0.5 * (low + high)
-        wide = spread(np.hypot(scaled, between)) > 1.0
-        low, high = np.where(wide, between, low), np.where(wide, high, between)
-    stated = np.where(spread(scaled) > 1.0, np.hypot(scaled, high), scaled)
-    misfit = (np.log(stated) + 0.5 * np.minimum((far / stated) ** 2, 9.0)).sum(axis=1)
-    return np.asarray(stated[int(np.argmin(misfit))], dtype=np.float64)
-
-
-def _merged(bands: Bands, smooth: _Smooth, steep: bool, state: _State) -> list[StripeFit | str]:
-    """The points of each band, or why there are none."""
-    if pays(0.0, KERNELS):
-        return _merged_compiled(bands, smooth, steep, state)
-    return [
-        _PROBLEMS[problem] or _points(bands, smooth, steep, state, b)
-        for b, problem in enumerate(smooth.problems.tolist())
-    ]
-
-
-def _merged_compiled(bands: Bands, smooth: _Smooth, steep: bool, state: _State) -> list[StripeFit | str]:
-    """`_merged` by kernels."""
-    from lidarpose.detect import stripe_profile_kernels
-
-    curves = np.concatenate([smooth.curves.coefficients, smooth.curves.middle, smooth.curves.half], axis=1)
-    inflation, sigma = np.empty(len(curves)), np.empty(bands.u.shape)
-    pixels, normals = np.empty((*bands.u.shape, 2)), np.empty((*bands.u.shape, 2))
-    profiles = (bands.u, bands.valid, smooth.weight, smooth.residual, bands.cosine, bands.sine, curves)
-    bounds = ((_BLOCK, _SHORT, _MIN_POINTS), (_WORST_SIGMA_PX, _MODEL_SIGMA_PX), _NOISE_FACTORS[:, 0], _HALVINGS)
-    points = (inflation, pixels, normals, sigma)
-    counts = stripe_profile_kernels.merge(*profiles, *bounds, steep, smooth.problems, *points)
-    found: list[StripeFit | str] = []
-    for b, problem in enumerate(smooth.problems.tolist()):
-        if problem:
-            found.append(_PROBLEMS[problem])
-            continue
-        points_b = StripePoints(*(x[b, : counts[b]].copy() for x in (pixels, normals, sigma)))
-        found.append(StripeFit(points_b, float(state.width[b]), float(state.dark_ratio[b]), float(inflation[b])))
-    return found
-
-
-def _points(bands: Bands, smooth: _Smooth, steep: bool, state: _State, b: int) -> StripeFit | str:
-    """Merge blocks of neighbouring profiles of band `b`; their scatter about the curve corrects what the noise model
-    states."""
-    valid = bands.valid[b]
-    weight = smooth.weight[b, valid]
-    length = _BLOCK if np.count_nonzero(weight) > _SHORT else _BLOCK // 2
-    block = np.floor(bands.u[b, valid] / length).astype(int)
-    block -= block[0]
-    total = np.bincount(block, weight)
-    enough = (np.bincount(block, weight > 0) >= length // 2) & (total > 0)
-    safe = np.where(enough, total, 1.0)
-    columns = (x[b, valid] for x in (bands.u, smooth.residual, bands.cosine, bands.sine))
-    u, offset, cosine, sine = ((np.bincount(block, weight * x) / safe)[enough] for x in columns)
-    sigma = 1.0 / np.sqrt(total[enough])
-    if len(u) < _MIN_POINTS:
-        return _TOO_FEW
-    freedom = np.sqrt(max(len(u) - 4, 1) / len(u))
-    inflation = max(MAD_TO_SIGMA * quantile(np.abs(offset / sigma), 0.5) / freedom, 1.0)
-    sigma = _stated_sigma(offset / freedom, sigma)
-    norm = np.hypot(cosine, sine)
-    cosine, sine = cosine / norm, sine / norm
-    sigma = np.hypot(sigma, _MODEL_SIGMA_PX) * cosine
-    # Points on dark squares beside points on light ones: a hundredth of their weight, and mostly trouble.
-    best = quantile(sigma, 0.2)
-    worth = sigma < np.clip(8.0 * best, 0.1, _WORST_SIGMA_PX)
-    if np.count_nonzero(worth) < max(_MIN_POINTS, len(u) // 2):
-        return _TOO_ROUGH
-    u, offset, cosine, sine, sigma = u[worth], offset[worth], cosine[worth], sine[worth], sigma[worth]
-    only = np.arange(len(smooth.problems)) == b
-    v = smooth.curves.take(only).at(u[None])[0] + offset
-    normals = np.stack([cosine, -sine] if steep else [-sine, cosine], axis=-1)
-    points = StripePoints(as_pixels(u, v, steep), normals, sigma)
-    return StripeFit(points, float(state.width[b]), float(state.dark_ratio[b]), inflation)

@@ -1,5 +1,5 @@
-"""What `stripe_fit` and `stripe_noise` do with profiles, compiled by numba: curves through their centres, their steps,
-the noise, and their merging into points; imported only where `stripe_kernels` are.
+"""What `stripe_fit`, `stripe_points` and `stripe_noise` do with profiles, compiled by numba: curves through their
+centres, their steps, the noise, and their merging into points; imported only where `stripe_kernels` are.
 
 The same as the NumPy way but for rounding in double precision: sums here run from the first profile to the last, small
 systems of equations are solved by Gauss's elimination. What is selected (medians, maxima) is the same.
@@ -14,7 +14,7 @@ import numpy as np
 from lidarpose.geometry.compiled import kernel
 from lidarpose.geometry.robust import MAD_TO_SIGMA
 
-# What `merge` says of a band, and `smooth`: the indices of `stripe_fit.PROBLEMS`.
+# What `merge` says of a band, and `smooth`: the indices of `stripe_points._PROBLEMS`.
 FINE, TOO_FEW, NOT_NARROW, TOO_ROUGH = range(4)
 
 
@@ -334,7 +334,7 @@ def smooth(
     residual: Any,
     problems: Any,
 ) -> None:
-    """`stripe_fit._smooth`: into `curves` (B, 6), four coefficients, middle and half, `kept` and `residual` (B, N),
+    """`stripe_points.smoothed`: into `curves` (B, 6), four coefficients, middle and half, `kept` and `residual` (B, N),
     and `problems` (B,)."""
     bands, profiles = u.shape
     x, sigma, weight = np.empty(profiles), np.empty(profiles), np.empty(profiles)
@@ -388,7 +388,7 @@ def _spread(far: Any, sigma: Any, factor: float, beside: float, some: Any, count
 
 @kernel
 def _stated_sigma(far: Any, sigma: Any, factors: Any, halvings: int, some: Any, count: int) -> Any:
-    """`stripe_fit._stated_sigma`: the likeliest factor and shared part; `far` are the offsets without sign."""
+    """`stripe_points._stated_sigma`: the likeliest factor and shared part; `far` are the offsets without sign."""
     for i in range(count):
         some[i] = far[i]
     widest = MAD_TO_SIGMA * float(select(some, count, int(0.5 * (count - 1))))
@@ -454,7 +454,7 @@ def merge(
     normals: Any,
     sigmas: Any,
 ) -> Any:
-    """`stripe_fit._points` of all bands that `smooth` found no problem with: pixels and normals (B, N, 2) and sigma
+    """`stripe_points._points` of all bands that `smooth` found no problem with: pixels and normals (B, N, 2) and sigma
     (B, N) of their points, and how many (B,).
 
     `sizes` are the length of a block, what a stripe is short below, and the fewest points; `limits` the worst sigma
