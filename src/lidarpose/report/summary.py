@@ -46,18 +46,19 @@ def figures_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[st
 
 
 def _print_list(console: Console, title: str, items: Sequence[str], *, numbered: bool) -> None:
-    from rich.padding import Padding
-    from rich.table import Table
-    from rich.text import Text
-
     if not items:
         return
+    from rich.text import Text
+
     console.print(Text(title, style="bold"))
     if not console.is_terminal:
         # Lines stay whole for those who search them.
         for k, item in enumerate(items):
             console.print(Text(f"  {k + 1}. {item}" if numbered else f"  - {item}"), soft_wrap=True)
         return
+    from rich.padding import Padding
+    from rich.table import Table
+
     listed = Table.grid(padding=(0, 1, 0, 0))
     for k, item in enumerate(items):
         listed.add_row(f"{k + 1}." if numbered else "-", Text(item))

@@ -8,6 +8,7 @@ import numpy as np
 
 from lidarpose.geometry.arrays import FloatArray, unit
 from lidarpose.geometry.planes import fit_plane
+from lidarpose.geometry.robust import medians, quantile
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.world_run import WorldPlace, WorldRun
 from lidarpose.report.markup import Markup
@@ -129,9 +130,9 @@ def frame_boxes(run: WorldRun) -> Markup | None:
     rows = [(k + 1, p) for k, p in enumerate(run.places) if known[k + 1].sum() >= MIN_FRAMES]
     if not rows:
         return None
-    off = {k: 1e3 * (p.frame_corners - np.median(p.frame_corners[known[k]], axis=0)) for k, p in rows}
+    off = {k: 1e3 * (p.frame_corners - medians(p.frame_corners[known[k]], axis=0)) for k, p in rows}
     used = np.concatenate([off[k][known[k]] for k, _ in rows])
-    reach = max(1.3 * float(np.percentile(np.abs(used), 99.5)), 1e-3)
+    reach = max(1.3 * quantile(np.abs(used), 0.995), 1e-3)
 
     def draw(width: float) -> Markup:
         count = len(run.places)
@@ -142,7 +143,7 @@ def frame_boxes(run: WorldRun) -> Markup | None:
         for axis, class_ in enumerate(FACE_CLASSES):
             where = np.array([k + 0.2 * (axis - 1) for k, _ in rows])
             kept = [off[k][known[k], axis] for k, _ in rows]
-            five = np.array([np.percentile(v, [2.5, 25.0, 75.0, 97.5]) for v in kept])
+            five = np.array([[quantile(v, share) for share in (0.025, 0.25, 0.75, 0.975)] for v in kept])
             chart.sticks(where, five[:, 0], five[:, 3], f"{class_} mid", max(1.0, thick / 5.0))
             chart.sticks(where, five[:, 1], five[:, 2], class_, thick)
             for at, (k, p) in zip(where, rows, strict=True):
