@@ -75,6 +75,14 @@ def test_the_faces_of_a_still_carton_are_square_after_twenty_frames() -> None:
     assert np.abs(face_angles_deg(free_corner(frames)[2]) - 90.0).max() < 1.5
 
 
+def test_a_carton_s_faces_are_all_that_is_flat_in_a_frame() -> None:
+    # As `measure planes` has it. The sixteen rings lie in a plane each, too.
+    first = sorted((folder("box_jimin") / "dataset").glob("*.pcd"))[0]
+    planes = measure_planes(view_of_cloud(read_cloud(first), None))
+    assert len(planes) == 3
+    assert np.abs(90.0 - plane_angles_deg(planes)[np.triu_indices(3, 1)]).max() < 3.0
+
+
 def test_the_clouds_themselves_tell_whether_beams_were_put_to_where_they_start() -> None:
     """The carton's driver let all beams start at one point; another one has them cross where the manual does."""
     first = sorted((folder("box_jimin") / "dataset").glob("*.pcd"))[0]

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.se3 import Pose, exp_so3
 from lidarpose.measure.planes import joined_planes, plane_angle_sigmas_deg, plane_angles_deg
 from lidarpose.model.beam_correction import BeamCorrection
 from lidarpose.model.calibration import TurntableCalibration
+from lidarpose.model.cloud import Cloud
 from lidarpose.model.turntable import PARAMETER_NAMES, TurntableMotion
 from lidarpose.simulate.surfaces import Sheet
 from lidarpose.workflows.measuring import measure_planes, plane_angle_sigmas, view_of_cloud, view_of_recording
@@ -100,3 +102,44 @@ def test_parallel_planes_are_as_uncertain_as_their_worse_direction() -> None:
         sigmas.append(plane_angle_sigmas_deg(planes, points)[0, 1])
     # The worse direction dominates: the angle is about the length of one normal value.
     assert np.sqrt(np.mean(np.square(angles))) == pytest.approx(np.mean(sigmas), rel=0.25)
+
+
+def test_a_cloud_in_any_frame_gives_its_planes() -> None:
+    """A room seen by 64 rings; not from the frame's origin, two points may lie in one direction."""
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(0.0, 360.0, 0.8)), np.radians(np.linspace(-60.0, 60.0, 64)))
+    flat = np.cos(elevation)
+    d = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(-1, 3)
+    low, high = np.array([-3.0, -3.5, -1.2]), np.array([3.0, 3.0, 1.4])
+    ranges = (np.where(d > 0.0, high, low) / np.where(d == 0.0, 1e-12, d)).min(axis=1)
+    seen = d * (ranges + 0.004 * np.random.default_rng(1).normal(size=len(d)))[:, None]
+    found = {}
+    for name, origin in {"its own": np.zeros(3), "the room's": -low, "a grid's": np.array([5e5, 5.4e6, 100.0])}.items():
+        planes = measure_planes(view_of_cloud(Cloud(seen + origin), None))[:6]
+        found[name] = sorted(p.points for p in planes)
+        for axis, side in ((k, face) for face in (low, high) for k in range(3)):
+            on_face = 0.5 * (low + high)
+            on_face[axis] = side[axis]
+            parallel = [p.plane for p in planes if abs(p.plane.normal[axis]) > 0.9999]
+            assert min(abs(float(p.distance(on_face + origin))) for p in parallel) < 0.001
+    np.testing.assert_allclose(found["the room's"], found["its own"], rtol=0.02)
+    np.testing.assert_allclose(found["a grid's"], found["its own"], rtol=0.02)
+    with pytest.raises(UndeterminedError, match="single precision"):
+        view_of_cloud(Cloud((seen + [5e5, 5.4e6, 100.0]).astype(np.float32)), None)
+
+
+def test_a_ring_of_a_sparse_lidar_is_no_plane() -> None:
+    """A carton's corner a metre before sixteen rings: each ring's points lie in a plane through the LiDAR, too."""
+    normals = exp_so3([0.4, -0.6, 0.3]) @ np.diag([-1.0, 1.0, -1.0])
+    corner = np.array([1.0, -0.05, -0.1])
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(-45.0, 45.0, 0.2)), np.radians(np.arange(-15.0, 16.0, 2.0)))
+    flat = np.cos(elevation)
+    d = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(-1, 3)
+    # A convex corner is met where the last of its faces is.
+    ranges = ((normals @ corner)[:, None] / (normals @ d.T)).max(axis=0)
+    rng = np.random.default_rng(2)
+    points = d * (ranges + 0.004 * rng.normal(size=len(d)))[:, None]
+    near = points[np.linalg.norm(d * ranges[:, None] - corner, axis=1) < 0.35]
+    planes = measure_planes(view_of_cloud(Cloud(near.astype(np.float32)), None))
+    along = np.abs(np.stack([p.plane.normal for p in planes]) @ normals.T)
+    assert along[:3].max(axis=0) == pytest.approx(1.0, abs=1e-3)
+    assert along.max(axis=1) == pytest.approx(1.0, abs=3e-3)

@@ -94,10 +94,12 @@ def import_bag(
     """
     from lidarpose.cli.console import err
     from lidarpose.cli.console import out as console
+    from lidarpose.errors import InputError
     from lidarpose.model.scan import LidarSpec
     from lidarpose.storage.bag_import import ImportOptions
     from lidarpose.storage.bag_import import import_bag as make
     from lidarpose.storage.cloud_import import PlaceOptions
+    from lidarpose.storage.clouds import CLOUD_SUFFIXES
     from lidarpose.storage.packets import import_packets
 
     if axis_beam_deg is not None:
@@ -105,7 +107,14 @@ def import_bag(
         console().print(f"{out} (recording): {summary}", markup=False, soft_wrap=True)
         return
     where = PlaceOptions(place, world_m)
-    if bag.suffix.lower() == ".pcap":
+    if bag.suffix.lower() in CLOUD_SUFFIXES:
+        raise InputError(
+            bag,
+            "is a cloud",
+            expected="a ROS bag or Velodyne packets, or --axis-beam-deg for the cloud of a spun 2D LiDAR",
+            remedy="Clouds of a corner session are named in its positions.csv (docs/formats.md).",
+        )
+    if bag.suffix.lower() in (".pcap", ".pcapng"):
         report = import_packets(bag, out, where)
     else:
         options = ImportOptions(

@@ -67,7 +67,9 @@ def _check_records(path: Path) -> None:
     with path.open("rb") as file:
         head = file.read(24)
         if len(head) < 24 or head[:4] not in _MAGICS:
-            raise InputError(path, "does not start as a pcap file", expected="a pcap file (pcapng: convert it first)")
+            raise InputError(
+                path, "does not start as a pcap file", expected="a pcap file (pcapng: `editcap -F pcap` converts it)"
+            )
         order = "<" if head[:4] in (b"\xd4\xc3\xb2\xa1", b"\x4d\x3c\xb2\xa1") else ">"
         position = 24
         while position < size:

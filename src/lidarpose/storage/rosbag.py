@@ -161,7 +161,9 @@ def _reader(storage: Path) -> tuple[Any, Callable[[bytes, str], Any]]:
 
         return Reader1(storage), _types("ROS1_NOETIC").deserialize_ros1
     if not storage.is_dir() and storage.suffix not in (".db3", ".mcap"):
-        raise InputError(storage, "is no ROS bag", expected="a .bag, .db3 or .mcap file, or a ROS 2 bag's folder")
+        raise InputError(
+            storage, "is no ROS bag", expected="a .bag, .db3, .mcap or .pcap file, or a ROS 2 bag's folder"
+        )
     if any(mark in str(storage) for mark in "?#%"):
         raise InputError(storage, "has ?, # or % in its path, which the database takes for its own", expected="none")
     from rosbags.rosbag2 import Reader as Reader2

@@ -28,6 +28,9 @@ from lidarpose.workflows.scanning import in_true_angles, require_times
 
 # Ranges without any noise are still rounded to float32.
 _LEAST_NOISE_M = 1e-5
+# Coordinates in longer steps hold no shapes. Single precision has 1 mm at 10 km from the origin, 0.5 m in a national
+# grid.
+_LONGEST_STEP_M = 5e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +40,9 @@ class MeasuringView:
     Attributes
     ----------
     beams
-        A grid of beams in the frame named by `frame`.
+        A grid of beams in the frame named by `frame`; empty for a cloud that gives none.
     noise_m
-        Of a range.
+        Of a range; NaN where too few beams lie side by side to tell.
     sees_behind
         False if only the object's own points can be trusted: the cloud's viewpoint is not known.
     covariance, moved, shifts
@@ -47,6 +50,10 @@ class MeasuringView:
         change of these, and the derivative of points of flat indices by them.
     remarks
         What a person should know of it.
+    from_sensor
+        All beams start at the frame's origin. Planes through it are seen edge-on: a ring's points lie in one.
+    cloud : (N, 3)
+        All points of a cloud that does not tell its beams: the grid may hold one of several.
     """
 
     beams: Beams
@@ -57,6 +64,24 @@ class MeasuringView:
     moved: MovedBeams | None = None
     shifts: PointShifts | None = None
     remarks: tuple[str, ...] = ()
+    from_sensor: bool = False
+    cloud: FloatArray | None = None
+
+    @property
+    def grid(self) -> Beams:
+        """The beams. Raises UndeterminedError where they are too few to tell their noise."""
+        if not np.isfinite(self.noise_m):
+            raise UndeterminedError(
+                "There are too few returns side by side to measure anything",
+                remedy="Record at least eight sweeps with eight beams each on the object; give clouds in the frame of "
+                "their sensor.",
+            )
+        return self.beams
+
+    @property
+    def points(self) -> FloatArray:
+        """(N, 3), NaN for beams without return."""
+        return self.beams.points.reshape(-1, 3) if self.cloud is None else self.cloud
 
 
 def view_of_recording(recording: SweepRecording, calibration: TurntableCalibration) -> MeasuringView:
@@ -95,13 +120,21 @@ def view_of_recording(recording: SweepRecording, calibration: TurntableCalibrati
 def view_of_cloud(cloud: Cloud, calibration: TurntableCalibration | None) -> MeasuringView:
     """Beams recovered from a plain cloud: by the turntable's motion, by the LiDAR's rings, or by directions alone.
 
+    Where they give none, the view holds the points alone, which suffice for planes.
+
     Raises
     ------
     UndeterminedError
-        If the points give no beams.
+        If there are too few points.
     """
     keep = np.isfinite(cloud.points).all(axis=1) & (np.abs(cloud.points).max(axis=1, initial=0.0) > 1e-6)
     points = cloud.points[keep].astype(np.float64)
+    step_m = float(np.median(np.spacing(np.abs(cloud.points[keep])).max(axis=1))) if len(points) else 0.0
+    if step_m > _LONGEST_STEP_M:
+        raise UndeterminedError(
+            f"The cloud lies too far from its origin for single precision: its points come in steps of {step_m:.2g} m",
+            remedy="Write it in double precision, or subtract an offset before it is written.",
+        )
     light = None
     if "intensity" in cloud.fields:
         light = np.asarray(cloud.fields["intensity"][keep], dtype=np.float64)
@@ -117,12 +150,13 @@ def view_of_cloud(cloud: Cloud, calibration: TurntableCalibration | None) -> Mea
     ring = next((cloud.fields[name][keep] for name in ("ring", "line", "channel") if name in cloud.fields), None)
     beams = beams_of_rings(points, ring, light)
     if beams is not None:
-        return MeasuringView(beams, _noise(beams, None), cloud.frame or "cloud")
+        return MeasuringView(beams, _noise(beams, None), cloud.frame or "cloud", from_sensor=True)
     beams = beams_of_cells(points, light)
     if beams is None:
-        raise UndeterminedError("The cloud's points give no grid of beams", remedy="Give the sweep recording instead.")
+        none = Beams(np.zeros((0, 0, 3)), np.zeros((0, 0, 3)), np.zeros((0, 0)))
+        return MeasuringView(none, np.nan, cloud.frame or "cloud", False, cloud=points)
     remark = "the cloud does not tell its beams: sizes are good to about half the distance between points"
-    return MeasuringView(beams, _noise(beams, None), cloud.frame or "cloud", False, remarks=(remark,))
+    return MeasuringView(beams, _noise(beams, None), cloud.frame or "cloud", False, remarks=(remark,), cloud=points)
 
 
 def measure_disk(view: MeasuringView, kind: Kind = "disk", *, seed: int = 0) -> list[RoundMeasurement]:
@@ -136,7 +170,7 @@ def measure_disk(view: MeasuringView, kind: Kind = "disk", *, seed: int = 0) -> 
     UndeterminedError
         If nothing round is found.
     """
-    found = measure_round(view.beams, view.noise_m, kind, sees_behind=view.sees_behind, seed=seed)
+    found = measure_round(view.grid, view.noise_m, kind, sees_behind=view.sees_behind, seed=seed)
     if not found:
         raise nothing_round(kind)
     if view.covariance is None or view.moved is None:
@@ -152,7 +186,7 @@ def measure_box(view: MeasuringView, *, seed: int = 0) -> BoxMeasurement:
     UndeterminedError
         If no box is found, or an end of an edge is not seen.
     """
-    box = measure_box_of(view.beams, view.noise_m, seed=seed)
+    box = measure_box_of(view.grid, view.noise_m, seed=seed)
     if view.covariance is None or view.moved is None:
         return box
     return box_with_calibration(box, view.moved, view.covariance)
@@ -171,10 +205,16 @@ def measure_planes(view: MeasuringView, *, least_share: float = 0.002, seed: int
     UndeterminedError
         If nothing flat is found.
     """
-    points = view.beams.points.reshape(-1, 3)
+    points = view.points
     seen = np.flatnonzero(np.isfinite(points[:, 0]))
-    patches = segment_planes(points[seen], PlaneSearch(min_points=60, min_share=least_share, seed=seed, bent=True))
-    planes = joined_planes(points, [seen[p.indices] for p in patches], view.noise_m)
+    # Coordinates of a national grid are too long for single precision.
+    near = points[seen] if view.cloud is None else points - np.median(points, axis=0)
+    search = PlaneSearch(min_points=60, min_share=least_share, seed=seed, bent=True, from_sensor=view.from_sensor)
+    patches = segment_planes(near, search)
+    noise_m = view.noise_m
+    if patches and (view.cloud is not None or not np.isfinite(noise_m)):
+        noise_m = float(np.median([p.sigma_m for p in patches]))
+    planes = joined_planes(points, [seen[p.indices] for p in patches], noise_m)
     if not planes:
         raise UndeterminedError(
             "Nothing flat was found", remedy="A plane must hold at least 60 points and a five hundredth of all."
@@ -184,8 +224,7 @@ def measure_planes(view: MeasuringView, *, least_share: float = 0.002, seed: int
 
 def plane_angle_sigmas(view: MeasuringView, planes: Sequence[MeasuredPlane]) -> FloatArray:
     """Standard deviations (n, n) in degrees of the angles between measured planes, the calibration's share included."""
-    points = view.beams.points.reshape(-1, 3)
-    return plane_angle_sigmas_deg(planes, points, view.shifts, view.covariance)
+    return plane_angle_sigmas_deg(planes, view.points, view.shifts, view.covariance)
 
 
 def with_readings_between(recording: SweepRecording) -> SweepRecording:
@@ -201,13 +240,8 @@ def with_readings_between(recording: SweepRecording) -> SweepRecording:
 
 
 def _noise(beams: Beams, stated_m: float | None) -> float:
-    """Range noise: measured in the beams, or as stated where they are too few for that."""
+    """Range noise: measured in the beams, as stated where they are too few for that, or NaN."""
     sigma = range_noise(beams.range_m)
     if np.isfinite(sigma):
         return max(sigma, _LEAST_NOISE_M)
-    if stated_m is not None:
-        return stated_m
-    raise UndeterminedError(
-        "There are too few returns side by side to measure anything",
-        remedy="Record at least eight sweeps with eight beams each on the object.",
-    )
+    return np.nan if stated_m is None else stated_m
