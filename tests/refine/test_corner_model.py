@@ -23,6 +23,7 @@ from lidarpose.refine.corner_model import (
     place_discrepancies,
     reweighted,
 )
+from lidarpose.refine.face_shape import face_shape
 from lidarpose.refine.frame_corners import PlaceFrames
 from lidarpose.refine.free_corner import fit_corner
 from lidarpose.refine.spot_scatter import spot_scatter, weighed_by_angle
@@ -302,3 +303,43 @@ def test_narrow_beams_are_weighed_as_they_are() -> None:
         weighed.append(weighed_by_angle(fit, places, spot_scatter(fit, places)) is not fit)
     # Chance reaches the gain once in twelve times.
     assert sum(weighed) <= 5
+
+
+def bent(places: list[CornerPlaceFaces], rng: np.random.Generator, off_m: float) -> list[CornerPlaceFaces]:
+    """The places with a face that is off its plane by a sum of waves of 15 to 60 cm, alike at all of them."""
+    waves = rng.normal(size=(12, 3)) * 2.0 * np.pi / rng.uniform(0.15, 0.6, (12, 1))
+    phases, sizes = rng.uniform(0.0, 2.0 * np.pi, 12), rng.normal(0.0, off_m / np.sqrt(6.0), 12)
+    normal = TRUTH.inverse().rotate(NORMALS_WORLD)[0]
+    found = []
+    for place in places:
+        f, corner = place.faces[0], TRUTH.inverse() @ place.corner_world
+        on_face = f.range_m[:, None] * f.rays.T - corner
+        off = np.cos(on_face @ waves.T + phases) @ sizes
+        ranges_m = f.range_m + off / (normal @ f.rays)
+        found.append(replace(place, faces={**place.faces, 0: FaceReturns(f.rays.T, ranges_m, f.frame)}))
+    return found
+
+
+def test_what_bends_a_face_at_all_places_is_told_and_in_the_covariance() -> None:
+    squared, without = [], []
+    for seed in range(30):
+        rng = np.random.default_rng([seed, 5])
+        places = bent(observe(beams(400, rng), rng), rng, 0.003)
+        fit = fit_corner_model(places, start(), SIGMA_M)
+        shape = face_shape(fit, places)
+        assert shape is not None
+        assert set(shape.off_m) == {0}
+        error = (TRUTH @ fit.state.T_world_lidar.inverse()).log()
+        squared.append(error @ np.linalg.solve((fit.covariance + shape.covariance)[:6, :6], error))
+        without.append(error @ np.linalg.solve(fit.pose_covariance, error))
+    assert np.mean(without) > 20.0
+    assert 3.0 < np.mean(squared) < 9.0
+
+
+def test_flat_faces_are_bent_by_nothing() -> None:
+    found = []
+    for seed in range(30):
+        rng = np.random.default_rng([seed, 6])
+        places = observe(beams(400, rng), rng)
+        found.append(face_shape(fit_corner_model(places, start(), SIGMA_M), places))
+    assert sum(shape is not None for shape in found) <= 1

@@ -17,6 +17,7 @@ from lidarpose.model.corner_session import CloudFrame
 from lidarpose.model.observation import LeftOut
 from lidarpose.refine.beam_crossing import MAKERS_CROSSING_M, OpenCrossing, SeenCrossing
 from lidarpose.refine.corner_model import CornerFit
+from lidarpose.refine.face_shape import FaceShape
 from lidarpose.refine.slipped_place import TURN_DEG, TURN_STATISTIC
 from lidarpose.refine.spot_scatter import SpotScatter, common_error_factor
 from lidarpose.refine.wrong_coordinate import WrongCoordinate
@@ -30,6 +31,8 @@ NOISE_RATIO_DOUBTFUL = 3.0
 LEAST_MISFIT_M = 0.002
 # A crossing that the data leave open is named where it is at least so likely, and moves the pose so far beyond chance.
 OPEN_CHANCE, OPEN_SIGMAS = 0.05, 3.0
+# By how often faces' shape may multiply the pose's standard deviation.
+SHAPE_TIMES = 2.0
 # The z of the sensor's up: so low is odd where one reflected in the places' plane stands so much straighter.
 MOST_TILTED, MORE_UPRIGHT = 0.5, 0.4
 
@@ -41,8 +44,9 @@ class CornerEvidence:
     `rings_told` are the degrees of freedom that offsets of rings have taken from the residuals; `crossing` is where a
     multi-beam LiDAR's beams seem to cross, None where that was not asked. `further_covariance` (n, n) is of
     what the residuals cannot tell; `scatter` is that of the spots, where it is known. `wrong` is the place whose world
-    coordinates alone may be wrong, `possible` a crossing of the beams that the data leave open; both are in that
-    covariance. `turntable_unknown`: clouds have the errors of a turntable whose calibration states none.
+    coordinates alone may be wrong, `possible` a crossing of the beams that the data leave open, `shape` what faces are
+    off planes by; all are in that covariance. `turntable_unknown`: clouds have the errors of a turntable whose
+    calibration states none.
     """
 
     positions: tuple[str, ...]
@@ -61,6 +65,7 @@ class CornerEvidence:
     wrong: WrongCoordinate | None = None
     possible: OpenCrossing | None = None
     turntable_unknown: bool = False
+    shape: FaceShape | None = None
 
 
 @dataclass(frozen=True)
@@ -126,6 +131,9 @@ def judge_corner_fit(
         _judge_crossing(verdict, evidence.crossing)
     if evidence.possible is not None:
         _judge_open_crossing(verdict, evidence.possible, factor * fit.pose_covariance)
+    if evidence.shape is not None:
+        figures["faces_off_planes_mm"] = {f"face {j + 1}": 1e3 * off for j, off in evidence.shape.off_m.items()}
+        _judge_shape(verdict, evidence.shape, fit.state.T_world_lidar, covariance[:6, :6])
     if evidence.turntable_unknown:
         verdict.doubt(
             "the turntable's calibration states no covariance, so that its errors are not in the standard deviations: "
@@ -173,6 +181,17 @@ def _judge_open_crossing(verdict: _Verdict, possible: OpenCrossing, covariance: 
         )
 
 
+def _judge_shape(verdict: _Verdict, shape: FaceShape, pose: Pose, covariance: FloatArray) -> None:
+    """`covariance` (6, 6) of the pose holds what the shape does to it."""
+    with_it, without = (_worst(pose, c) for c in (covariance, covariance - shape.covariance[:6, :6]))
+    if max(a / b for a, b in zip(with_it, without, strict=True)) > SHAPE_TIMES:
+        faces = ", ".join(f"face {j + 1} by {1e3 * off:.1f} mm" for j, off in sorted(shape.off_m.items()))
+        verdict.doubt(
+            f"parts of the target are off the planes of their faces, alike at all places (standard deviations: {faces}"
+            "): it is bent, or something is fixed to it or stands right beside it"
+        )
+
+
 def judge_corners(
     T_world_lidar: Pose,
     world: FloatArray,
@@ -195,15 +214,21 @@ def judge_corners(
 
 
 def _figures(pose: Pose, covariance: FloatArray, evidence: CornerEvidence) -> dict[str, Any]:
-    uncertain = UncertainPose(pose, covariance)
-    position = np.sqrt(np.linalg.eigvalsh(uncertain.centre_covariance())[-1])
-    rotation = np.sqrt(np.linalg.eigvalsh(uncertain.rotation_covariance())[-1])
+    position_m, rotation_rad = _worst(pose, covariance)
     return {
-        "sigma_position_mm": 1e3 * float(position),
-        "sigma_rotation_deg": float(np.degrees(rotation)),
+        "sigma_position_mm": 1e3 * position_m,
+        "sigma_rotation_deg": float(np.degrees(rotation_rad)),
         "left_out": [{"what": item.what, "reason": item.reason} for item in evidence.left_out],
         "corner_scatter_mm": {k: [round(1e3 * float(x), 4) for x in v] for k, v in evidence.frame_scatter_m.items()},
     }
+
+
+def _worst(pose: Pose, covariance: FloatArray) -> tuple[float, float]:
+    """Standard deviations of the LiDAR's centre and of the rotation, in their worst directions."""
+    uncertain = UncertainPose(pose, covariance)
+    parts = (uncertain.centre_covariance(), uncertain.rotation_covariance())
+    position, rotation = (float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in parts)
+    return position, rotation
 
 
 def _face_angles_deg(normals: FloatArray) -> list[float]:

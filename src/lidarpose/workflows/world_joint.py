@@ -24,6 +24,7 @@ from lidarpose.model.world_run import WorldRun
 from lidarpose.refine.corner_model import CornerFit, CornerState, own_turns, stepped, undetected_world_noise
 from lidarpose.refine.corner_verdict import CornerEvidence, PrecisionLimits, judge_corner_fit
 from lidarpose.refine.face_rims import without_rims
+from lidarpose.refine.face_shape import face_shape
 from lidarpose.refine.face_systems import MIN_RETURNS, MIN_SIGMA_M
 from lidarpose.refine.frame_corners import PlaceFrames
 from lidarpose.refine.free_corner import FreeCorner
@@ -224,7 +225,8 @@ def _judged(
         fit = weighed_by_angle(fit, used, scatter)
     share = turntable_share(session, fit, used)
     wrong = wrong_coordinate(fit)
-    further = [part.covariance for part in (share, wrong, beside.possible) if part is not None]
+    shape = face_shape(fit, used)
+    further = [part.covariance for part in (share, wrong, beside.possible, shape) if part is not None]
     if session.world_sigma_m is None:
         further.append(unsure_noise(fit) if fit.world_sigma_m > 0.0 else undetected_world_noise(fit))
     further_covariance = np.asarray(sum(further)) if further else None
@@ -245,6 +247,7 @@ def _judged(
         wrong,
         beside.possible,
         share is None and holds_scans(session),
+        shape,
     )
     quality = judge_corner_fit(fit, used, evidence, limits)
     covariance = fit.covariance * float(quality.figures["covariance_factor"])
