@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lidarpose.detect.cloud_planes import largest_component
 from lidarpose.detect.plane_raster import cell_size_m, grown, raster_of
+from lidarpose.detect.plane_sample import Bits, bits, shared_points
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
 from lidarpose.geometry.robust import mad_sigma, quantile
@@ -42,6 +43,8 @@ EDGE_ON = 0.06
 # A surface is rough, and rings are off, by so much even where ranges are perfect.
 FLOOR_M = 0.002
 RIVALS, REFITS = 8, 3
+# Distances of so many planes fit into a core's own memory.
+PLANES_AT_ONCE = 16
 # A sample that showed so many slabs and no surface since the last one has none to show.
 MOST_FAILURES = 60
 
@@ -181,8 +184,7 @@ def _harvest(
     at_most: int,
 ) -> list[PlanePatch]:
     """The patches that one sample shows, best first; their points are no longer `free`."""
-    gate_m = GATE_SIGMAS * sigma_m
-    near, counted = _near(sample, planes, gate_m)
+    near = _near(sample, planes, GATE_SIGMAS * sigma_m)
     active = np.ones(len(drawn), dtype=bool)
     dead = np.zeros(len(planes), dtype=bool)
     share = max(np.count_nonzero(free) / len(drawn), 1.0)
@@ -191,13 +193,14 @@ def _harvest(
     patches: list[PlanePatch] = []
     failures = 0
     while len(patches) < at_most and failures < MOST_FAILURES and not dead.all():
-        votes = np.where(dead, -1.0, counted @ active.astype(np.float32))
+        votes = np.where(dead, -1, shared_points(near, active))
         leaders = np.argsort(-votes, kind="stable")[: 4 * RIVALS : 4]
         best, size, leader = None, 0, int(leaders[0])
         for k in leaders:
             if votes[k] <= max(size, least):
                 break
-            piece = largest_component(single, near[k] & active, _plane(planes[k]))
+            flags = np.unpackbits(near[k].view(np.uint8), count=len(active)).view(bool)
+            piece = largest_component(single, flags & active, _plane(planes[k]))
             if np.count_nonzero(piece) > size:
                 best, size, leader = piece, int(np.count_nonzero(piece)), int(k)
         if best is None:
@@ -206,22 +209,27 @@ def _harvest(
         if patch is None or len(patch) < min_points or size < least:
             failures += 1
             dead[leader] = True
-            dead |= counted @ best.astype(np.float32) > 0.8 * size
+            dead |= shared_points(near, best) > 0.8 * size
             continue
         failures = 0
         patches.append(patch)
         free[patch.indices] = False
         active &= free[drawn]
-        dead |= counted @ active.astype(np.float32) < least
+        dead |= shared_points(near, active) < least
     return patches
 
 
-def _near(sample: _Beams, planes: FloatArray, gate_m: float) -> tuple[BoolArray, NDArray[np.float32]]:
-    """Which returns (N,) end on which planes q (H, 3), as flags (H, N) and as numbers to be summed up."""
-    cosine = planes @ sample.rays.T
-    near = np.abs((cosine - sample.inverse) * sample.range_m**2) < gate_m
-    near &= cosine > EDGE_ON * np.linalg.norm(planes, axis=1)[:, None]
-    return near, near.astype(np.float32)
+def _near(sample: _Beams, planes: FloatArray, gate_m: float) -> Bits:
+    """Which returns (N,) end on which planes q (H, 3), in bits (H, W)."""
+    columns = np.ascontiguousarray((sample.rays * (sample.range_m**2)[:, None]).T, dtype=np.float32)
+    range_m, inverse = sample.range_m.astype(np.float32), sample.inverse.astype(np.float32)
+    rows, edge_on = planes.astype(np.float32), (EDGE_ON * np.linalg.norm(planes, axis=1)).astype(np.float32)
+    near = []
+    for first in range(0, len(planes), PLANES_AT_ONCE):
+        some = slice(first, first + PLANES_AT_ONCE)
+        # A return that ends on a plane has the inverse range that the plane gives it.
+        near.append(bits((np.abs(rows[some] @ columns - range_m) < gate_m) & (inverse > edge_on[some, None])))
+    return np.concatenate(near) if near else np.empty((0, 0), dtype=np.uint64)
 
 
 def _plane(q: FloatArray) -> Plane:

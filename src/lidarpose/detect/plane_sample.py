@@ -134,11 +134,11 @@ def _near(points: Float32Array, planes: FloatArray, gate_m: float) -> Bits:
         distance += some[:, 2:3] * columns[2]
         distance -= some[:, 3:]
         np.abs(distance, out=distance)
-        near[first : first + together] = _bits(distance < np.float32(gate_m))
+        near[first : first + together] = bits(distance < np.float32(gate_m))
     return near
 
 
-def _bits(flags: BoolArray) -> Bits:
+def bits(flags: BoolArray) -> Bits:
     """Flags (..., S) in words of 64 (..., W), the last filled up with zeros."""
     packed = np.packbits(flags, axis=-1)
     lacking = -packed.shape[-1] % 8
@@ -149,7 +149,7 @@ def _bits(flags: BoolArray) -> Bits:
 
 def shared_points(near: Bits, flags: BoolArray) -> IntArray:
     """How many (H,) of the flagged points (S,) are near each plane."""
-    both = near & _bits(flags)
+    both = near & bits(flags)
     if hasattr(np, "bitwise_count"):
         return np.asarray(np.bitwise_count(both).sum(axis=1, dtype=np.int64))
     return np.asarray(_BITS_OF_BYTE[both.view(np.uint8)].sum(axis=1, dtype=np.int64))  # NumPy 1
