@@ -88,3 +88,11 @@ def test_patches_say_where_planes_are_and_scattered_points_have_none() -> None:
     assert len(segment_noisy_planes(scattered, range_sigma_m=0.02)) == 0
     assert segment_noisy_planes(points[:4]) == ()
     assert segment_noisy_planes(np.repeat(points[:1], 50, axis=0)) == ()
+
+
+def test_beams_without_return_at_the_origin_count_for_nothing() -> None:
+    rng = np.random.default_rng(5)
+    points = carton(np.array([1.9, -0.1, -0.55]), 0.6, 0.02, 0.2, rng)
+    alone = segment_noisy_planes(points, range_sigma_m=0.02)
+    with_them = segment_noisy_planes(np.concatenate([points, np.zeros((3000, 3))]), range_sigma_m=0.02)
+    assert [p.indices.tolist() for p in with_them] == [p.indices.tolist() for p in alone]

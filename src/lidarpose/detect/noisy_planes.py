@@ -26,6 +26,7 @@ SAMPLE_SIZE = 5000
 SEEDS = 900
 ROUNDS = 8
 MOST_PLANES = 40
+NEAREST_M = 1e-3
 # Neighbours of a seed, and how far they may be: wide enough for a normal in noise, and no wider than a face.
 NEIGHBOURS = 40
 REACHES_M = (0.10, 0.20, 0.20)
@@ -61,7 +62,7 @@ class _Beams:
     @staticmethod
     def of(points: NDArray[np.floating]) -> _Beams:
         x = np.asarray(points, dtype=np.float64)
-        range_m = np.maximum(np.sqrt(np.einsum("ij,ij->i", x, x)), 1e-3)
+        range_m = np.maximum(np.sqrt(np.einsum("ij,ij->i", x, x)), NEAREST_M)
         return _Beams(x, x / range_m[:, None], range_m, 1.0 / range_m)
 
     def take(self, index: IntArray) -> _Beams:
@@ -96,7 +97,9 @@ def segment_noisy_planes(
     """
     rng = np.random.default_rng(seed)
     beams = _Beams.of(points)
-    index = np.arange(len(beams.points))
+    # Beams without return stand at the origin in some drivers' clouds.
+    index = np.flatnonzero(beams.range_m > NEAREST_M)
+    beams = beams.take(index)
     patches: list[PlanePatch] = []
     sigma_m = range_sigma_m
     for k in range(ROUNDS):

@@ -209,11 +209,11 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
             candidates[k] += place_corners(place, seed + attempt, frame, FEWEST_FACE_RETURNS)
         matches, world, oddity = _match_with_mistakes(candidates, world_coordinates(session), session.estimate_scale)
     for attempt in range(NOISY_LOOKS):
-        missing = _missing(matches, len(world))
-        if not missing:
+        # Fewer than half of the places may fit by chance; where more do, those left add nothing but time.
+        if matches and 2 * matches[0].places >= len(world):
             break
-        for k in missing:
-            candidates[k] += noisy_corners(session.places[k], session.lidar.range_sigma_m, seed + attempt)
+        for k, place in enumerate(session.places):
+            candidates[k] += noisy_corners(place, session.lidar.range_sigma_m, seed + attempt)
         matches, world, oddity = _match_with_mistakes(candidates, world_coordinates(session), session.estimate_scale)
     if not matches:
         by_edges = _find_by_edges(session, seed)
@@ -221,13 +221,6 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
             raise _not_found(session, candidates)
         return by_edges
     return _found(session, candidates, matches, world, oddity)
-
-
-def _missing(matches: Sequence[CornerMatch], count: int) -> list[int]:
-    """The places without a corner; all of them where fewer than half have one, which chance may do."""
-    if not matches or 2 * matches[0].places < count:
-        return list(range(count))
-    return [k for k in range(count) if matches[0].choice[k] is None]
 
 
 def _find_by_edges(session: CornerSession, seed: int) -> FoundTarget | None:
