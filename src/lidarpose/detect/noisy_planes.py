@@ -24,7 +24,7 @@ from lidarpose.model.plane_patch import PlanePatch
 
 SAMPLE_SIZE = 5000
 SEEDS = 900
-ROUNDS = 8
+ROUNDS = 3
 MOST_PLANES = 40
 NEAREST_M = 1e-3
 # Neighbours of a seed, and how far they may be: wide enough for a normal in noise, and no wider than a face.
@@ -47,7 +47,7 @@ RIVALS, REFITS = 8, 3
 # Distances of so many planes fit into a core's own memory.
 PLANES_AT_ONCE = 16
 # A sample that showed so many slabs and no surface since the last one has none to show.
-MOST_FAILURES = 60
+MOST_FAILURES = 20
 
 
 @dataclass(frozen=True, eq=False)
