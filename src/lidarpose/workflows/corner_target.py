@@ -39,7 +39,10 @@ from lidarpose.workflows.moving_target import MIN_FACE_RETURNS, find_by_motion, 
 HINT_CROP_M = 1.5
 # A face in a single frame: at the first look, and at later ones where no target was found.
 FACE_RETURNS, FEWEST_FACE_RETURNS = 30, 15
-LOOKS, NOISY_LOOKS = 4, 2
+LOOKS = 4
+# In noise a second look finds the target at one place in fifteen more: worth it for three or four, none of which may
+# lack; no help where half of many do.
+NOISY_LOOKS, NOISY_LOOKS_AT_MANY, MANY_PLACES = 2, 1, 5
 # Where they fail, so many frames of a place at most, and points, are looked at together.
 STACKED_FRAMES, STACKED_POINTS = 20, 300_000
 GATE_SIGMAS = 6.5
@@ -208,7 +211,7 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
             frame = attempt * len(place.clouds) // LOOKS
             candidates[k] += place_corners(place, seed + attempt, frame, FEWEST_FACE_RETURNS)
         matches, world, oddity = _match_with_mistakes(candidates, world_coordinates(session), session.estimate_scale)
-    for attempt in range(NOISY_LOOKS):
+    for attempt in range(NOISY_LOOKS if len(world) < MANY_PLACES else NOISY_LOOKS_AT_MANY):
         # Fewer than half of the places may fit by chance; where more do, those left add nothing but time.
         if matches and 2 * matches[0].places >= len(world):
             break
