@@ -186,6 +186,20 @@ def cell_size(points: Any, least_gap: float, gap_per_range: float) -> float:
 
 
 @kernel
+def _cells_along(points: Any, axes: Any, cell_m: float) -> Any:
+    """Cells (N, 2) of points (N, 3) on a plane with the axes (2, 3), and each axis's least and greatest (2,)."""
+    along, low, high = np.empty((len(points), 2), np.int64), np.empty(2, np.int64), np.empty(2, np.int64)
+    for i in range(2):
+        a, b, c = np.float32(axes[i, 0] / cell_m), np.float32(axes[i, 1] / cell_m), np.float32(axes[i, 2] / cell_m)
+        for k in range(len(points)):
+            cell = np.int64(np.floor(a * points[k, 0] + b * points[k, 1] + c * points[k, 2]))
+            along[k, i] = cell
+            low[i] = cell if k == 0 else min(low[i], cell)
+            high[i] = cell if k == 0 else max(high[i], cell)
+    return along, low, high
+
+
+@kernel
 def largest_piece(points: Any, inside: Any, axes: Any, least_gap: float, gap_per_range: float, most_cells: int) -> Any:
     """Of the points (S, 3) that are `inside` (S,), those (S,) of the largest piece that hangs together on the plane
     with the axes (2, 3)."""
@@ -201,22 +215,14 @@ def largest_piece(points: Any, inside: Any, axes: Any, least_gap: float, gap_per
     if n == 0:
         return result
     cell_m = cell_size(chosen[:n], least_gap, gap_per_range)
-    along, low, high = np.empty((n, 2), np.int64), np.empty(2, np.int64), np.empty(2, np.int64)
-    for i in range(2):
-        a, b, c = np.float32(axes[i, 0] / cell_m), np.float32(axes[i, 1] / cell_m), np.float32(axes[i, 2] / cell_m)
-        for k in range(n):
-            cell = np.int64(np.floor(a * chosen[k, 0] + b * chosen[k, 1] + c * chosen[k, 2]))
-            along[k, i] = cell
-            low[i] = cell if k == 0 else min(low[i], cell)
-            high[i] = cell if k == 0 else max(high[i], cell)
-    low_u, low_v = low[0], low[1]
-    height, width = min(high[0] - low_u + 1, most_cells), min(high[1] - low_v + 1, most_cells)
+    along, low, high = _cells_along(chosen[:n], axes, cell_m)
+    height, width = min(high[0] - low[0] + 1, most_cells), min(high[1] - low[1] + 1, most_cells)
     # A frame of empty cells, so that each has eight neighbours.
     line = width + 2
     count = np.zeros((height + 2) * line, np.int32)
     cells = np.empty(n, np.int64)
     for k in range(n):
-        u, v = along[k, 0] - low_u, along[k, 1] - low_v
+        u, v = along[k, 0] - low[0], along[k, 1] - low[1]
         cells[k] = (u + 1) * line + v + 1 if u < height and v < width else 0
         if cells[k] > 0:
             count[cells[k]] += 1
@@ -411,14 +417,7 @@ def first_in_each(points: Any, side: Any) -> Any:
 def _cells_around(seen: Any, axes: Any, cell_m: float, most: int) -> Any:
     """Cells (n, m) that points (M, 3) occupy on a plane with the axes (2, 3), and those next to them, and where the
     first cell lies (2,); see `plane_raster`."""
-    along, low, high = np.empty((len(seen), 2), np.int64), np.empty(2, np.int64), np.empty(2, np.int64)
-    for i in range(2):
-        a, b, c = np.float32(axes[i, 0] / cell_m), np.float32(axes[i, 1] / cell_m), np.float32(axes[i, 2] / cell_m)
-        for k in range(len(seen)):
-            cell = np.int64(np.floor(a * seen[k, 0] + b * seen[k, 1] + c * seen[k, 2]))
-            along[k, i] = cell
-            low[i] = cell if k == 0 else min(low[i], cell)
-            high[i] = cell if k == 0 else max(high[i], cell)
+    along, low, high = _cells_along(seen, axes, cell_m)
     low -= 1
     height, width = min(high[0] + 2 - low[0], most), min(high[1] + 2 - low[1], most)
     allowed = np.zeros((height, width), np.bool_)
