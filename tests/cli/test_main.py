@@ -38,7 +38,13 @@ def test_help_imports_nothing_heavy() -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [["nonsense"], ["pose"], ["pose", "missing.json", "--angle-deg", "1"], ["pose", "x.json", "--angle-deg", "nan"]],
+    [
+        ["simulate", "turntable", "out", "--seed", "1.5"],
+        ["nonsense"],
+        ["pose"],
+        ["pose", "missing.json", "--angle-deg", "1"],
+        ["pose", "x.json", "--angle-deg", "nan"],
+    ],
 )
 def test_wrong_usage_is_status_2_and_one_dry_message(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(arguments) == 2

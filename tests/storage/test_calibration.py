@@ -29,6 +29,13 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     path.write_text(json.dumps(document))
 
 
+def test_what_is_read_prints_short_and_is_read_by_its_name_as_text(tmp_path: Path) -> None:
+    write_calibration(tmp_path / "calibration.json", calibration())
+    again = read_calibration(str(tmp_path / "calibration.json"))
+    assert len(repr(again)) < 1000
+    assert "verdict='doubtful'" in repr(again)
+
+
 def test_a_turntable_calibration_round_trips(tmp_path: Path) -> None:
     path = tmp_path / "calibration.json"
     original = calibration()

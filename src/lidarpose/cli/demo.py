@@ -8,6 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
+from lidarpose.cli.options import WholeNumber
 from lidarpose.errors import InputError
 
 
@@ -15,8 +16,8 @@ def demo(
     out: Path = Path("lidarpose-demo"),
     /,
     *,
-    places: Annotated[int, Parameter(validator=validators.Number(gte=3, lte=200))] = 24,
-    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0,
+    places: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=3, lte=200))] = 24,
+    seed: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=0))] = 0,
 ) -> None:
     """Simulate, calibrate, scan and measure, in about a minute.
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from cyclopts import Token
 
 
 def finite(_: object, value: float | None) -> None:
@@ -20,6 +24,16 @@ def positive(_: object, value: float | None) -> None:
         raise ValueError(f"{value} is not a finite number above zero")
 
 
+def _whole(_: object, tokens: Sequence[Token]) -> int:
+    """A whole number; cyclopts would round 1.5."""
+    text = tokens[0].value
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError(f"{text} is not a whole number") from None
+
+
+WholeNumber = Annotated[int, Parameter(converter=_whole)]
 FiniteFloat = Annotated[float, Parameter(validator=finite)]
 PositiveFloat = Annotated[float, Parameter(validator=positive)]
 

@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter, validators
 
+from lidarpose.cli.options import WholeNumber
+
 
 def simulate_corners(
     out: Path,
@@ -15,15 +17,15 @@ def simulate_corners(
     pose: Literal["1", "2", "arrow"] = "1",
     lidar: Literal["hdl32", "vlp16", "turntable"] = "hdl32",
     target: Literal["cube", "arrow", "oblique", "concave"] | None = None,
-    frames: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=1000))] = 20,
-    places: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=100))] = 6,
-    clutter: Annotated[int, Parameter(validator=validators.Number(gte=0, lte=100))] = 0,
+    frames: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=1, lte=1000))] = 20,
+    places: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=1, lte=100))] = 6,
+    clutter: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=0, lte=100))] = 0,
     room: bool = False,
     hints: bool = False,
     range_sigma_m: Annotated[float, Parameter(validator=validators.Number(gte=0.0, lte=0.5))] = 0.008,
     world_sigma_m: Annotated[float, Parameter(validator=validators.Number(gte=0.0, lte=1.0))] = 0.0,
     dropout: Annotated[float, Parameter(validator=validators.Number(gte=0.0, lt=1.0))] = 0.02,
-    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0,
+    seed: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=0))] = 0,
     suffix: Literal[".pcd", ".ply", ".las", ".laz", ".e57", ".npy"] = ".pcd",
     force: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:

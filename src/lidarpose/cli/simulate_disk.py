@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter, validators
 
+from lidarpose.cli.options import WholeNumber
+
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0.0, lt=1.0))]
 Tilt = Annotated[float, Parameter(validator=validators.Number(gte=0.0, lte=75.0))]
 
@@ -29,7 +31,7 @@ def simulate_disk(
     dropout: Share = 0.0,
     beam_step_deg: Annotated[float, Parameter(validator=validators.Number(gte=0.005, lte=2.0))] = 1.0 / 12.0,
     sweep_step_deg: Annotated[float, Parameter(validator=validators.Number(gte=0.005, lte=2.0))] = 0.05,
-    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0,
+    seed: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=0))] = 0,
     force: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:
     """Simulate a sweep recording of a disk, as in the turntable paper's section 3.2.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter, validators
 
-from lidarpose.cli.options import FiniteFloat, PositiveFloat
+from lidarpose.cli.options import FiniteFloat, PositiveFloat, WholeNumber
 from lidarpose.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def simulate_scene(
     mixing: Literal["mean", "strongest", "first", "random", "dropped"] = "mean",
     range_sigma_m: Annotated[FiniteFloat, Parameter(validator=validators.Number(gte=0.0, lte=0.5))] = 0.001,
     dropout: Annotated[FiniteFloat, Parameter(validator=validators.Number(gte=0.0, lt=1.0))] = 0.0,
-    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0,
+    seed: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=0))] = 0,
     force: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:
     """Simulate a sweep recording of boxes, disks and planes that a scene file describes.

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter, validators
 
-from lidarpose.cli.options import FiniteFloat, Json, PositiveFloat, Quiet
+from lidarpose.cli.options import FiniteFloat, Json, PositiveFloat, Quiet, WholeNumber
 from lidarpose.model.rig_family import Family
 
 
@@ -15,17 +15,17 @@ def simulate_turntable(
     out: Path,
     /,
     *,
-    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0,
+    seed: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=0))] = 0,
     family: Family = "paper",
-    places: Annotated[int | None, Parameter(validator=validators.Number(gte=1, lte=10_000))] = None,
+    places: Annotated[WholeNumber | None, Parameter(validator=validators.Number(gte=1, lte=10_000))] = None,
     step_deg: PositiveFloat | None = None,
     start_deg: FiniteFloat | None = None,
     range_sigma_mm: Annotated[FiniteFloat, Parameter(validator=validators.Number(gte=0.0, lte=500.0))] = 1.0,
-    width: Annotated[int, Parameter(validator=validators.Number(gte=200, lte=10_000))] = 1624,
-    height: Annotated[int, Parameter(validator=validators.Number(gte=150, lte=10_000))] = 1234,
-    placements: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=20))] = 1,
-    board_shots: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=100))] = 3,
-    sweeps: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=1000))] = 1,
+    width: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=200, lte=10_000))] = 1624,
+    height: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=150, lte=10_000))] = 1234,
+    placements: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=1, lte=20))] = 1,
+    board_shots: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=1, lte=100))] = 3,
+    sweeps: Annotated[WholeNumber, Parameter(validator=validators.Number(gte=1, lte=1000))] = 1,
     stripe: bool = True,
     lit_stripes: Annotated[bool, Parameter(negative=())] = False,
     saturated: Annotated[bool, Parameter(negative=())] = False,

@@ -22,7 +22,7 @@ class Quality:
 
     verdict: Verdict
     reasons: tuple[str, ...] = ()
-    figures: Mapping[str, Any] = field(default_factory=dict)
+    figures: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def caution(self) -> str | None:
@@ -62,10 +62,10 @@ class TurntableCalibration:
     """
 
     motion: TurntableMotion
-    parameter_covariance: FloatArray | None = None
-    parameter_names: tuple[str, ...] = PARAMETER_NAMES
+    parameter_covariance: FloatArray | None = field(default=None, repr=False)
+    parameter_names: tuple[str, ...] = field(default=PARAMETER_NAMES, repr=False)
     quality: Quality | None = None
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict, repr=False)
     beams: BeamCorrection = field(default_factory=BeamCorrection)
 
     @property
@@ -115,11 +115,11 @@ class WorldCalibration:
     T_world_source: Pose
     source: Literal["lidar", "camera"] = "lidar"
     scale: float = 1.0
-    covariance: FloatArray | None = None
+    covariance: FloatArray | None = field(default=None, repr=False)
     parameter_names: tuple[str, ...] = ()
     parameter_covariance: FloatArray | None = None
     quality: Quality | None = None
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
 
 Calibration = TurntableCalibration | WorldCalibration

@@ -49,6 +49,10 @@ class SweepRecording:
     time_s: RealArray | None = None
     lidar: LidarSpec = field(default_factory=LidarSpec)
 
+    def __repr__(self) -> str:
+        sweeps, beams = self.range_m.shape
+        return f"SweepRecording({self.name!r}, {sweeps} sweeps of {beams} beams, {self.lidar})"
+
     def __post_init__(self) -> None:
         if self.range_m.ndim != 2:
             raise ValueError(f"range_m has shape {self.range_m.shape}, expected (sweeps, beams)")

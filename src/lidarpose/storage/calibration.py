@@ -94,7 +94,7 @@ def transform_entry(parent: str, child: str, pose: Pose, covariance: FloatArray 
     return entry
 
 
-def read_calibration(path: Path) -> Calibration:
+def read_calibration(path: Path | str) -> Calibration:
     """Read a calibration of either kind.
 
     Raises
@@ -106,6 +106,7 @@ def read_calibration(path: Path) -> Calibration:
     from lidarpose.storage.calibration_schema import CalibrationFile
     from lidarpose.storage.schemas import parse
 
+    path = Path(path)
     document = read_json(path, "a calibration.json, as `lidarpose calibrate` writes it")
     file = parse(path, CalibrationFile, check_format(path, document, CALIBRATION_FORMAT))
     quality = None
@@ -117,7 +118,7 @@ def read_calibration(path: Path) -> Calibration:
     return _world(path, file, quality)
 
 
-def read_turntable_calibration(path: Path) -> TurntableCalibration:
+def read_turntable_calibration(path: Path | str) -> TurntableCalibration:
     """Read a calibration that must be a turntable's. Raises InputError as `read_calibration`, or for another kind."""
     calibration = read_calibration(path)
     if not isinstance(calibration, TurntableCalibration):
@@ -126,7 +127,7 @@ def read_turntable_calibration(path: Path) -> TurntableCalibration:
     return calibration
 
 
-def read_world_calibration(path: Path) -> WorldCalibration:
+def read_world_calibration(path: Path | str) -> WorldCalibration:
     """Read a calibration that must be a world one. Raises InputError as `read_calibration`, or for another kind."""
     calibration = read_calibration(path)
     if not isinstance(calibration, WorldCalibration):

@@ -106,7 +106,7 @@ class FileRecording:
         )
 
 
-def read_corner_session(folder: Path) -> CornerSession:
+def read_corner_session(folder: Path | str) -> CornerSession:
     """Read a corner session's description; clouds are read later, when they are asked for.
 
     Raises
@@ -114,6 +114,7 @@ def read_corner_session(folder: Path) -> CornerSession:
     InputError
         Naming the file, the key or line, what was expected and how to mend it.
     """
+    folder = Path(folder)
     file = folder / "session.toml"
     if not folder.is_dir():
         problem = "is missing" if not folder.exists() else "is not a folder"

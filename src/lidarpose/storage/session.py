@@ -93,7 +93,7 @@ class FileScan:
         return read_scan(self.path)
 
 
-def read_turntable_session(folder: Path, *, any_order: bool = False) -> TurntableSession:
+def read_turntable_session(folder: Path | str, *, any_order: bool = False) -> TurntableSession:
     """Read a session's description; images and scans are read later, when they are asked for.
 
     Parameters
@@ -108,6 +108,7 @@ def read_turntable_session(folder: Path, *, any_order: bool = False) -> Turntabl
     InputError
         Naming the file, the key or line, what was expected and how to mend it.
     """
+    folder = Path(folder)
     file = folder / "session.toml"
     if not folder.is_dir():
         raise InputError(
@@ -298,9 +299,10 @@ def _check_one_way(table: TextTable, rows: IntArray, angle_deg: FloatArray) -> N
         first_at[float(angle)] = line
     wrong = first_out_of_order(angle_deg)
     if wrong is not None:
+        turn = "repeat" if angle_deg[wrong] == angle_deg[wrong - 1] else "turn back"
         raise InputError(
             table.path,
-            f"the readings turn back at line {lines[wrong]} ({angle_deg[wrong]:g} after {angle_deg[wrong - 1]:g})",
+            f"the readings {turn} at line {lines[wrong]} ({angle_deg[wrong]:g} after {angle_deg[wrong - 1]:g})",
             field="turntable_angle_deg",
             expected="readings that only grow or only fall, as the table turns",
             remedy=f"Look whether images and scans belong to their rows (10 sorts before 2). {remedy}",

@@ -14,7 +14,7 @@ def truth_path(folder: Path) -> Path:
     return resolved.with_name(resolved.name + ".truth.json")
 
 
-def read_turntable_truth(folder: Path) -> TurntableMotion | None:
+def read_turntable_truth(folder: Path | str) -> TurntableMotion | None:
     """The true motion of a simulated session; None where there is no truth beside it, or one of another kind.
 
     Raises
@@ -24,7 +24,7 @@ def read_turntable_truth(folder: Path) -> TurntableMotion | None:
     """
     from lidarpose.storage.calibration import transform_from
 
-    path = truth_path(folder)
+    path = truth_path(Path(folder))
     if not path.is_file():
         return None
     document = read_json(path)
