@@ -33,6 +33,13 @@ def test_a_recording_is_told_where_to_go(tmp_path: Path, capsys: pytest.CaptureF
     assert "is a sweep recording" in capsys.readouterr().err
 
 
+def test_options_of_turntables_are_refused_for_corners(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "session.toml").write_text('format = "lidarpose/corner-session@1"\n')
+    for option in (["--any-order"], ["--beams-turn", "clockwise-from-above"]):
+        assert run(["inspect", str(tmp_path), *option]) == 2
+        assert f"{option[0]}: is for turntable sessions" in capsys.readouterr().err
+
+
 def test_a_session_without_stripes_is_described_and_refused(
     simulated_session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

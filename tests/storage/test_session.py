@@ -82,6 +82,11 @@ def test_placements_have_sub_folders(folder: Path) -> None:
     assert {p.placement for p in session.places} == {"left"}
 
 
+def _without_second_panel(file: Path) -> None:
+    first, _, rest = file.read_text().rpartition("[[board.panels]]")
+    file.write_text(first + rest[rest.index("[lidar]") :])
+
+
 FLAWS = {
     "no session.toml": (lambda f: (f / "session.toml").unlink(), "session.toml: is missing"),
     "not toml": (lambda f: (f / "session.toml").write_text("format = "), "not valid TOML"),
@@ -94,6 +99,7 @@ FLAWS = {
         lambda f: replace(f / "session.toml", "[lidar]", "[[board.panels]]\ncolumns=5\nrows=5\nsquare_m=0.1\n[lidar]"),
         "board.panels",
     ),
+    "one panel": (lambda f: _without_second_panel(f / "session.toml"), "board.panels: has 1; expected at least 2"),
     "no camera": (lambda f: (f / "camera.yaml").unlink(), "camera: names 'camera.yaml', which is missing"),
     "no board images": (lambda f: (f / "board/0.png").unlink(), "board.images: no image matches"),
     "missing stripe image": (lambda f: (f / "stripes/001.png").unlink(), "line 3: stripe_image: names"),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from lidarpose.cli.options import FiniteFloat, Json, PositiveFloat, Quiet
+from lidarpose.cli.options import FiniteFloat, Json, PositiveFloat, Quiet, only_for
 from lidarpose.errors import InputError, RejectedError
 from lidarpose.model.sense import Sense, StatedSense
 
@@ -116,18 +116,18 @@ def calibrate(
     of_corners = {"--estimate-scale": estimate_scale, "--turntable": turntable is not None}
     of_recordings = {"--axis-beam-deg": axis_beam_deg is not None, "--start": start is not None}
     if is_recording(session):
-        _only_for("turntable sessions", of_turntables)
-        _only_for("corner sessions", of_corners)
-        _only_for("sessions", {"--method": method != "joint"}, "nothing: a recording has one method")
+        only_for("turntable sessions", of_turntables)
+        only_for("corner sessions", of_corners)
+        only_for("sessions", {"--method": method != "joint"}, "nothing: a recording has one method")
         from lidarpose.cli.calibrate_recording import calibrate_recording
 
         mounting: dict[str, Any] = {"axis_beam_deg": axis_beam_deg, "start": start, "estimate": estimate}
         calibrate_recording(session, output, never_stops=never_stops, **mounting, **common)
         return
     found = session_format(session)
-    _only_for("sweep recordings", of_recordings, "a folder with recording.toml")
+    only_for("sweep recordings", of_recordings, "a folder with recording.toml")
     if found == CORNER_SESSION_FORMAT:
-        _only_for("turntable sessions", {**of_turntables, "--estimate": bool(estimate)})
+        only_for("turntable sessions", {**of_turntables, "--estimate": bool(estimate)})
         from lidarpose.cli.calibrate_world import calibrate_world_session
 
         wanted: dict[str, Any] = {"method": method, "estimate_scale": estimate_scale or None, "turntable": turntable}
@@ -135,9 +135,9 @@ def calibrate(
         _refuse_if_rejected(calibration.quality)
         return
     _require_turntable_session(session, found, method, estimate)
-    _only_for("corner sessions", of_corners)
+    only_for("corner sessions", of_corners)
     sweeps = {"--never-stops": never_stops is True, "--stops": never_stops is False}
-    _only_for("sweep recordings", sweeps, "a recording, or a corner session with recordings")
+    only_for("sweep recordings", sweeps, "a recording, or a corner session with recordings")
     options = {
         "method": method,
         "first_panel": first_panel,
@@ -150,13 +150,6 @@ def calibrate(
     }
     run = _calibrate_turntable(session, options, with_report=report, quiet=quiet or json)
     _finish(run, session, output, with_report=report, json=json, quiet=quiet)
-
-
-def _only_for(what: str, given: Mapping[str, bool], expected: str | None = None) -> None:
-    """Refuse the first of the options that are given where there is nothing for them."""
-    for option, is_given in given.items():
-        if is_given:
-            raise InputError(option, f"is for {what}", expected=expected, remedy="Leave it out")
 
 
 def _require_turntable_session(folder: Path, found: str, method: str, estimate: Sequence[str]) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from lidarpose.cli.options import Json, Quiet
+from lidarpose.cli.options import Json, Quiet, only_for
 from lidarpose.errors import InputError, UndeterminedError
 from lidarpose.model.sense import Sense, StatedSense
 
@@ -55,6 +55,12 @@ def inspect(
         )
     found = session_format(session)
     if found == CORNER_SESSION_FORMAT:
+        given = {
+            "--any-order": any_order,
+            "--beams-turn": beams_turn is not None,
+            "--table-turns": table_turns is not None,
+        }
+        only_for("turntable sessions", given)
         _inspect_corners(session, json=json)
     elif found == SESSION_FORMAT:
         _inspect_turntable(

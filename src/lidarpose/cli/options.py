@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+
+from lidarpose.errors import InputError
 
 if TYPE_CHECKING:
     from cyclopts import Token
@@ -22,6 +24,13 @@ def positive(_: object, value: float | None) -> None:
     """Refuse what is not a finite number above zero."""
     if value is not None and not (math.isfinite(value) and value > 0.0):
         raise ValueError(f"{value} is not a finite number above zero")
+
+
+def only_for(what: str, given: Mapping[str, bool], expected: str | None = None) -> None:
+    """Refuse the first of the options that are given where there is nothing for them."""
+    for option, is_given in given.items():
+        if is_given:
+            raise InputError(option, f"is for {what}", expected=expected, remedy="Leave it out")
 
 
 def _whole(_: object, tokens: Sequence[Token]) -> int:

@@ -28,6 +28,11 @@ def parse(path: Path, schema: type[S], document: Any) -> S:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         field = ".".join(str(part) for part in first["loc"]) or "the document"
-        found = "" if first["type"] in ("missing", "extra_forbidden") else f", found {shown(first['input'])}"
-        message = {"missing": "is missing", "extra_forbidden": "is not a known key"}.get(first["type"], first["msg"])
+        kind, limits = first["type"], first.get("ctx", {})
+        if kind in ("too_short", "too_long"):
+            least_or_most = f"least {limits['min_length']}" if kind == "too_short" else f"most {limits['max_length']}"
+            count = limits["actual_length"]
+            raise InputError(path, f"has {count}", field=field, expected=f"at {least_or_most}") from None
+        found = "" if kind in ("missing", "extra_forbidden") else f", found {shown(first['input'])}"
+        message = {"missing": "is missing", "extra_forbidden": "is not a known key"}.get(kind, first["msg"])
         raise InputError(path, f"{message}{found}", field=field) from None

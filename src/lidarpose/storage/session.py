@@ -56,7 +56,7 @@ class _PanelSection:
 @dataclass(frozen=True)
 class _BoardSection:
     images: str
-    panels: Annotated[list[_PanelSection], Within(min_length=1, max_length=2)]
+    panels: Annotated[list[_PanelSection], Within(min_length=2, max_length=2)]
 
 
 @dataclass(frozen=True)
