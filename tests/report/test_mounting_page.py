@@ -55,6 +55,10 @@ def test_a_good_page_tells_its_numbers(runs: dict[str, MountingRun]) -> None:
     assert "Good: use this calibration" in text
     assert "What to do" not in text
     assert "a &lt;room&gt;" in text
+    assert "at reading 0 (z along its axis), which files call camera" in text
+    assert "cv2.projectPoints" not in text
+    for number in run.calibration.pose(0.0).translation:
+        assert f"{number:.6f}" in text
     for words in ("Tilt against the axis", "Surface 6", "off the plane, mm", "left alone", "What no scene can tell"):
         assert words in text
     for surface in run.estimate.surfaces:

@@ -11,8 +11,11 @@ from lidarpose.report.markup import Markup, el
 from lidarpose.report.page import card, folded, section, table
 
 
-def answer_section(calibration: Calibration, angle_deg: float = 0.0) -> Markup:
-    """The pose, at a reading of the turntable where there is one, and what to give to which program."""
+def answer_section(calibration: Calibration, angle_deg: float = 0.0, *, has_camera: bool = True) -> Markup:
+    """The pose, at a reading of the turntable where there is one, and what to give to which program.
+
+    Without a camera the frame that files call `camera` is the table's at reading 0.
+    """
     rejected = calibration.quality is not None and calibration.quality.verdict == "rejected"
     lead = (
         "To look into only: this calibration is rejected, and no program should be given it."
@@ -20,19 +23,24 @@ def answer_section(calibration: Calibration, angle_deg: float = 0.0) -> Markup:
         else "Six decimals: a micrometre, and a micrometre at a metre's distance. calibration.json has all digits."
     )
     if isinstance(calibration, TurntableCalibration):
-        cards = _turntable_cards(calibration, angle_deg)
+        cards = _turntable_cards(calibration, angle_deg, has_camera)
     else:
         cards = _world_cards(calibration)
     return section("The pose, and how to use it", lead, *cards)
 
 
-def _turntable_cards(calibration: TurntableCalibration, angle_deg: float) -> tuple[Markup, Markup]:
+def _turntable_cards(calibration: TurntableCalibration, angle_deg: float, has_camera: bool) -> tuple[Markup, Markup]:
     motion, pose = calibration.motion, calibration.pose(float(np.deg2rad(angle_deg)))
     angle = f"{angle_deg:.2f}"
+    frame = (
+        "the camera's (x right, y down, z forward)"
+        if has_camera
+        else "the table's at reading 0 (z along its axis), which files call camera"
+    )
     words = (
         "p_camera = T_camera_lidar p_lidar: it takes points from the LiDAR's frame (x along the beam at 0, y along the "
-        "beam at +90 degrees) to the camera's (x right, y down, z forward), in metres. Its columns are the LiDAR's x, "
-        "y and z axes and its centre, seen from the camera."
+        f"beam at +90 degrees) to {frame}, in metres. Its columns are the LiDAR's x, y and z axes and its centre, seen "
+        "from there."
     )
     at = "a, the turntable's reading in radians"
     if motion.reading_scale != 1.0:
@@ -47,6 +55,11 @@ def _turntable_cards(calibration: TurntableCalibration, angle_deg: float) -> tup
         _matrix(motion.T_turntable_lidar.matrix),
         el("p", "Or: ", el("code", "lidarpose pose calibration.json --angle-deg DEGREES")),
     )
+    opencv = (
+        "OpenCV",
+        "cv2.projectPoints(points_lidar, rvec, tvec, camera_matrix, distortion).",
+        "--to opencv -o rig.yaml",
+    )
     rows = [
         (
             "ROS 2",
@@ -54,12 +67,8 @@ def _turntable_cards(calibration: TurntableCalibration, angle_deg: float) -> tup
             "With the joint that moves it:",
             "--to ros2 -o rig.launch.py",
         ),
-        (
-            "OpenCV",
-            "cv2.projectPoints(points_lidar, rvec, tvec, camera_matrix, distortion).",
-            "--to opencv -o rig.yaml",
-        ),
-        *_cloud_rows(f"--to matrix --angle-deg {angle} -o T.txt", "camera's"),
+        *([opencv] if has_camera else []),
+        *_cloud_rows(f"--to matrix --angle-deg {angle} -o T.txt", "camera's" if has_camera else "table's"),
     ]
     title = f"T_camera_lidar while the turntable reads {angle}°"
     return card(title, el("p", words), *_numbers(pose, pose.matrix), always), _programs(rows)

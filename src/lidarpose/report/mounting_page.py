@@ -10,6 +10,7 @@ import numpy as np
 from lidarpose.geometry.arrays import FloatArray, perpendicular_pair
 from lidarpose.geometry.se3 import Pose
 from lidarpose.model.spun_scan import MountingRun, SurfacePoints
+from lidarpose.report.answer import answer_section
 from lidarpose.report.markup import Markup, el, join
 from lidarpose.report.numbers import fixed, plural, short
 from lidarpose.report.page import (
@@ -64,6 +65,7 @@ def mounting_page(run: MountingRun, name: str) -> str:
         tiles(_tiles(run)),
         _scene_section(run),
         *([_residual_section(run, seen)] if seen is not None else []),
+        answer_section(run.calibration, has_camera=False),
         section("The surfaces", "What was found flat, the largest first.", card("", _surface_table(run))),
         section("How sure", "Standard deviations, and what they are made of.", *_certainty(run)),
         section("What no scene can tell", "", card("", el("p", MIRROR_NOTE))),
