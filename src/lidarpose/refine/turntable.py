@@ -19,6 +19,7 @@ from lidarpose.refine.hit_squares import with_squares
 from lidarpose.refine.joint_options import JointOptions
 from lidarpose.refine.named_effect import paid_for, shift_of, strongest_effects, suggested, unseen_range_errors
 from lidarpose.refine.observability import pose_spread, weak_directions, whole_turn
+from lidarpose.refine.reading_noise import reading_noise
 from lidarpose.refine.stability import leave_places_out
 from lidarpose.refine.turntable_estimate import (
     OutsideParameters,
@@ -148,14 +149,17 @@ def _assemble(
     refused: Mapping[str, str],
 ) -> TurntableEstimate:
     data, angles = solution.data, solution.data.angles_rad
+    stability, noise = leave_places_out(solution, outside), noise_estimates(solution)
+    errors = reading_noise(solution)
+    if errors is not None:
+        solution = errors.solution
+        outside = outside_parameters(solution)
     inside_at = np.unique([angles.min(), data.reference_rad, angles.max()])
     extras = _judged_extras(solution, outside, options, refused, inside_at)
     effects = strongest_effects(solution, outside, options, extras, explanations(solution.suspicious or solution))
-    stability = leave_places_out(solution, outside)
     directions = weak_directions(outside.motion, outside.covariance[:10, :10], angles)
     outside = paid_for(outside, effects, data.reference_rad)
     C = _of_motion(outside)
-    noise = noise_estimates(solution)
     evidence = Evidence(
         noise=noise,
         range_sigma_m=observations.lidar.range_sigma_m,
@@ -173,6 +177,7 @@ def _assemble(
         duplicates=duplicates(observations),
         drift=(solution.suspicious or solution).drift,
         effects=effects,
+        reading_sigma_rad=0.0 if errors is None else errors.sigma_rad,
         unseen=unseen_range_errors(solution, outside, extras, options.want_mm),
         effect_shift=shift_of(outside, effects[0], data.reference_rad) if effects else (0.0, 0.0),
     )

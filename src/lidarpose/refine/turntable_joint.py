@@ -413,7 +413,7 @@ def _update_lines(
     soft: bool,
     with_places: bool,
 ) -> LineNoise:
-    spread = _parameter_spread(residuals, lines, moments, covariance)
+    spread = parameter_spread(residuals, lines, moments, covariance)
     places = PlaceEffects(0.0, np.ones(lines.count))
     if with_places:
         places = place_effects(moments, spread, noise.place_variance)
@@ -445,9 +445,7 @@ def _update_lines(
     )
 
 
-def _parameter_spread(
-    residuals: LineResiduals, lines: Lines, moments: FloatArray, covariance: FloatArray
-) -> FloatArray:
+def parameter_spread(residuals: LineResiduals, lines: Lines, moments: FloatArray, covariance: FloatArray) -> FloatArray:
     """What the parameters' uncertainty does to lines: covariance (S, b, b) of the basis' coefficients."""
     out = np.empty((lines.count, residuals.basis.shape[1], residuals.basis.shape[1]))
     for k in np.unique(lines.slot):

@@ -47,6 +47,7 @@ class Evidence:
     drift: Drift | None = None
     effects: Sequence[NamedEffect] = ()
     effect_shift: tuple[float, float] = (0.0, 0.0)
+    reading_sigma_rad: float = 0.0
     unseen: str | None = None
 
 
@@ -80,6 +81,9 @@ def judge(evidence: Evidence) -> Quality:
     _judge_drift(jury, evidence)
     _judge_size(jury, evidence)
     _judge_stability(jury, evidence)
+    if evidence.reading_sigma_rad > 0.0 and not evidence.effects:
+        scatter = f"{np.rad2deg(evidence.reading_sigma_rad):.2g} degrees from place to place"
+        jury.note(f"note: the turntable's readings are off by about {scatter}, which the standard deviations contain")
     if evidence.unseen is not None and not evidence.effects:
         jury.note(f"note: {evidence.unseen}")
     return Quality(_ORDER[jury.level], tuple(jury.reasons), _figures(evidence))
@@ -187,6 +191,7 @@ def _figures(evidence: Evidence) -> dict[str, Any]:
         "want_mm": evidence.want_mm,
         "want_deg": evidence.want_deg,
         "places": evidence.places,
+        "reading_sigma_deg": float(np.rad2deg(evidence.reading_sigma_rad)),
         "drift_ratio": None if evidence.drift is None else evidence.drift.ratio,
         "noise": {
             kind: {
