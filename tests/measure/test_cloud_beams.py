@@ -69,7 +69,8 @@ def test_round_holes_in_a_ring_cloud() -> None:
         assert len(found) == 2
         for hole in found:
             assert abs(hole.diameter_m - 0.24) < 4.0 * hole.sigma_m
-            assert hole.sigma_m < 0.003
+            # Nothing tells how wide the spots are: at 3 m commonly 6 to 22 mm.
+            assert 0.003 < hole.sigma_m < 0.012
         centres = sorted((m.centre for m in found), key=lambda c: c[1])
         np.testing.assert_allclose(centres, [[3.0, -0.3, 0.1], [3.0, 0.3, 0.1]], atol=0.003)
 
@@ -81,7 +82,7 @@ def test_a_cloud_without_beams_still_gives_a_size() -> None:
     assert beams is not None
     disk = measure_round(beams, range_noise(beams.range_m), "disk", sees_behind=False)[0]
     assert abs(disk.diameter_m - scene.diameter_m) < 0.003
-    assert 0.0005 < disk.sigma_m < 0.003
+    assert 0.002 < disk.sigma_m < 0.008
 
 
 def test_a_random_cloud_has_no_rings() -> None:

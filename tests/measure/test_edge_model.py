@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from lidarpose.measure.edge_model import EdgeBeams, fit_edge, fit_straight_edge
+from lidarpose.measure.edge_model import EdgeBeams, fit_edge, fit_straight_edge, usual_spot
 
 RADIUS = 0.05
 STEP = 0.002
@@ -45,11 +45,14 @@ def test_a_hole_is_a_disk_inside_out() -> None:
 
 def test_hits_and_misses_state_what_the_threshold_may_make() -> None:
     some = beams(np.random.default_rng(3), 0.0005)
-    hits = np.where(np.linalg.norm(some.place, axis=1) < RADIUS, 0.0, np.nan)
-    sharp = EdgeBeams(some.place, some.slope, hits, some.depth_sigma, np.ones(len(some), dtype=bool))
-    fit = fit_edge(sharp, np.array([2e-4, 1e-4]), RADIUS - 8e-4, inside=True, dropout=1e-4, reach=STEP)
-    assert abs(fit.radius - RADIUS) < 1e-4
-    assert 3e-4 < np.sqrt(fit.covariance[2, 2]) < 2e-3
+    open_ = np.ones(len(some), dtype=bool)
+    # What is seen when half of a spot is on the disk, and when a twentieth of a 10 mm spot is.
+    for beyond, spot_m in ((0.0, 0.0005), (1.64, 0.0025)):
+        hits = np.where(np.linalg.norm(some.place, axis=1) < RADIUS + beyond * spot_m, 0.0, np.nan)
+        sharp = EdgeBeams(some.place, some.slope, hits, some.depth_sigma, open_, usual_spot_m=usual_spot(2.0))
+        fit = fit_edge(sharp, np.array([2e-4, 1e-4]), RADIUS + 1e-3, inside=True, dropout=1e-4, reach=STEP)
+        assert abs(fit.radius - RADIUS - beyond * spot_m) < 2e-4
+        assert abs(fit.radius - RADIUS) < 1.5 * np.sqrt(fit.covariance[2, 2]) < 0.01
 
 
 def test_a_straight_edge() -> None:
@@ -61,9 +64,10 @@ def test_a_straight_edge() -> None:
     sigma = np.full((len(place), 2), 0.002)
     depth = 1.0 - F + rng.normal(0.0, 0.002, len(F))
     some = EdgeBeams(place, np.zeros_like(place), depth, sigma, np.zeros(len(F), dtype=bool))
-    offset, variance = fit_straight_edge(some, 0.0, dropout=1e-4, reach=STEP)
+    offset, variance, spot = fit_straight_edge(some, 0.0, dropout=1e-4, reach=STEP)
     assert abs(offset - 4e-4) < max(4.0 * np.sqrt(variance), 1e-5)
     assert np.sqrt(variance) < 5e-5
+    assert spot == pytest.approx(0.0006, rel=0.1)
 
 
 def test_the_same_beams_give_the_same_answer() -> None:

@@ -92,8 +92,9 @@ def _remarks(best: RoundMeasurement) -> list[str]:
     remarks = []
     if not best.threshold_known:
         remarks.append(
-            "no mixed returns and no fading light at the edge: a beam is taken to be seen if at least half of its spot "
-            "is on the material; sigma_mm holds what another threshold would change at a spot of about 2 mm"
+            "nothing tells of mixed returns or fading light at the edge: a beam is taken to be seen if half of "
+            "its spot is on the material; sigma_mm holds what another threshold would change for the spots that LiDARs "
+            "have at this distance, and every size of this recording may be off by the same"
         )
     if best.covered < 0.5:
         remarks.append(f"only {100 * best.covered:.0f} % of the edge is free")

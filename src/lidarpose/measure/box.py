@@ -17,7 +17,7 @@ from lidarpose.errors import UndeterminedError
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray, unit
 from lidarpose.geometry.planes import Plane
 from lidarpose.measure.beams import Beams, MovedBeams, calibration_sigmas, fit_plane_to_ranges, plane_ranges
-from lidarpose.measure.edge_beams import WIDEST_SPOT_M, PlaneView, edge_beams, view_of_patch
+from lidarpose.measure.edge_beams import WIDEST_SPOT_M, PlaneView, edge_beams, spot_ends, view_of_patch
 from lidarpose.measure.edge_model import fit_straight_edge
 from lidarpose.measure.outline import in_plane
 from lidarpose.measure.patches import Patch, find_patches
@@ -266,14 +266,19 @@ def _border(face: _Face, direction: FloatArray, sigma: float, seed: int) -> _End
     allowed: BoolArray = (place[:, 1] > low + guard) & (place[:, 1] < high - guard)
     placed = np.column_stack([place[:, 0], place[:, 1] - middle])
     view = PlaneView(**{**face.view.__dict__, "place": placed, "frame": frame})
-    chosen = edge_beams(view, place[:, 0] - last, size, sigma, allowed)
-    if chosen is None:
-        return None
-    near, edge, dropout = chosen
-    covered = float(np.ptp(edge.place[:, 1])) if len(edge) else 0.0
-    if covered < 0.3 * (high - low) or covered < 6.0 * face.view.step:
-        return None
-    offset, variance = fit_straight_edge(edge, last, dropout=dropout, reach=face.view.step, seed=seed)
+    offset, spot = last, WIDEST_SPOT_M
+    for _ in range(3):
+        chosen = edge_beams(view, place[:, 0] - offset, size, sigma, allowed, spot)
+        if chosen is None:
+            return None
+        near, edge, dropout = chosen
+        covered = float(np.ptp(edge.place[:, 1])) if len(edge) else 0.0
+        if covered < 0.3 * (high - low) or covered < 6.0 * face.view.step:
+            return None
+        offset, variance, width = fit_straight_edge(edge, offset, dropout=dropout, reach=face.view.step, seed=seed)
+        wide, spot = spot_ends(width) > 1.3 * spot, max(spot, spot_ends(width))
+        if not wide:
+            break
     border = face.middle + offset * e + middle * across
     # A plane that is off by a little moves the border of a face seen aslant along it.
     sight = face.view.beams.direction[near].mean(axis=0)

@@ -19,7 +19,15 @@ from lidarpose.measure.beams import (
     plane_frame,
     plane_ranges,
 )
-from lidarpose.measure.edge_beams import WIDEST_SPOT_M, PlaneView, box_of, edge_beams, places_on, view_of_patch
+from lidarpose.measure.edge_beams import (
+    WIDEST_SPOT_M,
+    PlaneView,
+    box_of,
+    edge_beams,
+    places_on,
+    spot_ends,
+    view_of_patch,
+)
 from lidarpose.measure.edge_model import EdgeBeams, EdgeFit, fit_edge, tells_threshold
 from lidarpose.measure.outline import (
     LEAST_GAP,
@@ -175,10 +183,10 @@ def _cavities(mask: BoolArray) -> list[BoolArray]:
 
 
 def _measure(beams: Beams, patch: Patch, outline: RoundOutline, sigma: float, seed: int) -> RoundMeasurement | None:
-    circle = outline.circle
-    for _ in range(3):
-        view, place_circle = _view(beams, patch, circle, outline.kind, sigma)
-        chosen = _chosen(view, place_circle, outline.kind, sigma)
+    circle, spot = outline.circle, WIDEST_SPOT_M
+    for _ in range(4):
+        view, place_circle = _view(beams, patch, circle, outline.kind, sigma, spot)
+        chosen = _chosen(view, place_circle, outline.kind, sigma, spot)
         if chosen is None:
             return None
         index, edge, dropout = chosen
@@ -193,7 +201,8 @@ def _measure(beams: Beams, patch: Patch, outline: RoundOutline, sigma: float, se
         )
         moved = max(abs(fit.radius - place_circle.radius), float(np.linalg.norm(fit.centre - place_circle.centre)))
         circle = _in_patch_axes(Circle2(fit.centre, fit.radius), view, patch, beams)
-        if moved < 0.75 * view.step:
+        wide, spot = spot_ends(fit.spot_m) > 1.3 * spot, max(spot, spot_ends(fit.spot_m))
+        if moved < 0.75 * view.step and not wide:
             break
     return _result(view, outline, index, edge, fit)
 
@@ -205,19 +214,23 @@ def _in_patch_axes(circle: Circle2, view: PlaneView, patch: Patch, beams: Beams)
     return Circle2(in_plane(centre, patch.plane, frame), circle.radius)
 
 
-def _view(beams: Beams, patch: Patch, circle: Circle2, kind: Kind, sigma: float) -> tuple[PlaneView, Circle2]:
+def _view(
+    beams: Beams, patch: Patch, circle: Circle2, kind: Kind, sigma: float, spot: float
+) -> tuple[PlaneView, Circle2]:
     """The box on its plane refitted to the ranges away from the edge, and the circle in the new axes."""
     place, frame, step = places_on(beams, patch)
-    guard = 1.5 * step + 0.5 * WIDEST_SPOT_M
+    guard = 1.5 * step + 0.5 * spot
     s = circle.distance(place) * (1.0 if kind == "disk" else -1.0)
     view = view_of_patch(beams, patch, patch.mask & (s < -min(guard, 0.4 * circle.radius)), sigma)
     centre = frame[0] + circle.centre @ frame[1:]
     return view, Circle2(in_plane(centre, view.plane, view.frame), circle.radius)
 
 
-def _chosen(view: PlaneView, circle: Circle2, kind: Kind, sigma: float) -> tuple[IntArray, EdgeBeams, float] | None:
+def _chosen(
+    view: PlaneView, circle: Circle2, kind: Kind, sigma: float, spot: float
+) -> tuple[IntArray, EdgeBeams, float] | None:
     s = circle.distance(view.place) * (1.0 if kind == "disk" else -1.0)
-    return edge_beams(view, s, circle.radius, sigma)
+    return edge_beams(view, s, circle.radius, sigma, spot=spot)
 
 
 def _result(view: PlaneView, outline: RoundOutline, near: IntArray, edge: EdgeBeams, fit: EdgeFit) -> RoundMeasurement:

@@ -10,13 +10,17 @@ from scipy.spatial import cKDTree
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.geometry.planes import Plane
 from lidarpose.measure.beams import Beams, fit_plane_to_ranges, plane_frame, plane_ranges
-from lidarpose.measure.edge_model import EdgeBeams
+from lidarpose.measure.edge_model import EdgeBeams, usual_spot
 from lidarpose.measure.outline import grid_step, in_plane
 from lidarpose.measure.patches import Patch
 
 WIDEST_SPOT_M = 0.004
-"""Beams within this of the edge may have a spot on both sides, whatever the distance between beams."""
+"""Beams whose axis passes the edge by less than this may have a spot on both sides, until a fit tells of wider ones."""
+# Standard deviations of a spot from its axis to where nothing of it is left that matters.
+_SPOT_ENDS = 2.5
 _NEIGHBOURS = 14
+# Noise of depths up to which those of one surface do not pass for mixed ones.
+_CLEAR = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +38,16 @@ class PlaneView:
     place: FloatArray
     excess: FloatArray
     step: float
+
+    @property
+    def slant(self) -> float:
+        """By what factor at most a round spot is drawn out on the plane: one over the cosine of the incidence."""
+        return 1.0 / float(np.median(np.abs(self.beams.direction[self.plane_used] @ self.plane.normal)))
+
+
+def spot_ends(spot_m: float) -> float:
+    """How far a spot of this standard deviation reaches from its axis, at least `WIDEST_SPOT_M`."""
+    return max(WIDEST_SPOT_M, _SPOT_ENDS * spot_m)
 
 
 def box_of(beams: Beams, patch: Patch) -> Beams:
@@ -85,7 +99,12 @@ def view_of_patch(beams: Beams, patch: Patch, inner: BoolArray, sigma: float) ->
 
 
 def edge_beams(
-    view: PlaneView, s: FloatArray, size: float, sigma: float, allowed: BoolArray | None = None
+    view: PlaneView,
+    s: FloatArray,
+    size: float,
+    sigma: float,
+    allowed: BoolArray | None = None,
+    spot: float = WIDEST_SPOT_M,
 ) -> tuple[IntArray, EdgeBeams, float] | None:
     """The beams that cross an edge where it is free, with the background each would see; None if too few.
 
@@ -97,10 +116,13 @@ def edge_beams(
         Half the extent of what the edge bounds, metres: the zone does not reach farther than half of it.
     allowed : (n,)
         Beams to choose from; all if None.
+    spot
+        How far the beams' spots reach from their axes.
     """
     noise = max(sigma, view.plane_rms)
-    zone = min(max(1.5 * WIDEST_SPOT_M, 3.0 * view.step), 0.5 * size)
-    first = min(max(WIDEST_SPOT_M, 1.5 * view.step), 0.6 * size)
+    spot = spot * view.slant
+    zone = min(max(1.5 * spot, 3.0 * view.step), 0.5 * size)
+    first = min(max(spot, 1.5 * view.step), 0.6 * size)
     allowed = np.ones(len(s), dtype=bool) if allowed is None else allowed
     reference = np.flatnonzero(allowed & (s > first) & (s < first + 5.0 * view.step))
     near = np.flatnonzero(allowed & (np.abs(s) < zone))
@@ -110,7 +132,7 @@ def edge_beams(
     near = near[~front[near]]
     if front.any():
         gap, _ = cKDTree(view.place[front & np.isfinite(view.place[:, 0])]).query(view.place[near])
-        near = near[gap > 2.0 * view.step + WIDEST_SPOT_M]
+        near = near[gap > 2.0 * view.step + spot]
     inner = s < -first
     dropout = float(np.mean(~np.isfinite(view.beams.range_m[inner]))) if inner.any() else 0.0
     dropout = min(max(dropout, 1e-4), 0.5)
@@ -120,27 +142,32 @@ def edge_beams(
     near, slope = near[kept], view.beams.direction[near[kept]] @ view.frame[1:].T
     light, light_sigma = _light(view, inner, near)
     light = None if light is None else np.where(open_[kept], light, np.nan)
-    edge = EdgeBeams(view.place[near], slope, depth[kept], depth_sigma[kept], open_[kept], light, light_sigma)
-    if not _mixes(edge, s[near], view.step, dropout):
+    usual = usual_spot(float(np.median(view.beams.range_m[view.plane_used])))
+    edge = EdgeBeams(view.place[near], slope, depth[kept], depth_sigma[kept], open_[kept], light, light_sigma, usual)
+    mixes = _mixes(edge, s[near], 1.5 * view.step + 0.5 * spot, dropout)
+    if mixes is False:
         near, edge = _hits_and_misses(near, edge)
-    return near, edge, dropout
+    return near, replace(edge, mixing_seen=mixes is True), dropout
 
 
-def _mixes(edge: EdgeBeams, s: FloatArray, step: float, dropout: float) -> bool:
-    """True if spots on two surfaces are seen to give what neither gives alone: ranges between, or no return.
+def _mixes(edge: EdgeBeams, s: FloatArray, reach: float, dropout: float) -> bool | None:
+    """Whether spots on two surfaces are seen to give what neither gives alone: ranges between, or no return.
 
     Where none is seen among all beams that cross the edge, the instrument decides for one surface by a threshold that
-    the data do not tell.
+    the data do not tell. None where noise hides it.
     """
-    near = ~edge.open & (np.abs(s) < 1.5 * step + 0.5 * WIDEST_SPOT_M)
-    # Only where a range between can be told from both.
-    clear = near & (edge.depth_sigma.max(axis=1) < 1.0 / 15.0)
-    if np.count_nonzero(clear) < 0.5 * np.count_nonzero(near):
-        return True
-    depth, sigma = edge.depth[clear], edge.depth_sigma[clear]
-    between = (depth > 5.0 * sigma[:, 0]) & (depth < 1.0 - 5.0 * sigma[:, 1])
+    near = ~edge.open & (np.abs(s) < reach)
+    depth, sigma = edge.depth[near], edge.depth_sigma[near]
     lost = float(np.mean(~np.isfinite(depth))) if depth.size else 0.0
-    return int(np.count_nonzero(between)) > max(1, depth.size // 200) or lost > 2.0 * dropout + 0.02
+    if lost > 2.0 * dropout + 0.02:
+        return True
+    # Only where a range between can be told from both.
+    clear = sigma.max(axis=1) < _CLEAR
+    depth, sigma = depth[clear], sigma[clear]
+    if depth.size < max(0.5 * len(clear), 1):
+        return None
+    between = (depth > np.maximum(4.0 * sigma[:, 0], 0.2)) & (depth < 1.0 - np.maximum(4.0 * sigma[:, 1], 0.2))
+    return bool(np.count_nonzero(between) > max(1, depth.size // 200))
 
 
 def _hits_and_misses(near: IntArray, edge: EdgeBeams) -> tuple[IntArray, EdgeBeams]:

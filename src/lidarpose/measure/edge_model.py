@@ -39,8 +39,9 @@ _OUTLIERS = 0.01
 _SOFTNESS = 0.02
 # The prior of the logarithm of the background's brightness over the material's.
 _CONTRAST_SIGMA = 0.7
-# The prior of the spot: its median as a standard deviation (2 mm across), and its spread as a logarithm.
-_USUAL_SPOT_M, _SPOT_SPREAD = 5e-4, 0.6
+# The prior of the spot: its median across at the start of the beam and by what it widens a metre, and its spread as a
+# logarithm. Makers state from 3 mm (0.4 mrad) to 11 mm (14 mrad) and more.
+_SPOT_AT_START_M, _SPOT_WIDENS, _SPOT_SPREAD = 0.005, 0.002, 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +65,10 @@ class EdgeBeams:
         Light of the open hits, relative to that of a spot wholly on the material; None where it tells nothing.
     light_sigma
         Its noise.
+    usual_spot_m
+        What spots have at this distance: the prior's median, as a standard deviation.
+    mixing_seen
+        True if spots on two surfaces are seen to give what neither gives alone.
     """
 
     place: FloatArray
@@ -73,6 +78,8 @@ class EdgeBeams:
     open: BoolArray
     light: FloatArray | None = None
     light_sigma: float = 1.0
+    usual_spot_m: float = 0.25 * _SPOT_AT_START_M
+    mixing_seen: bool = True
 
     def __len__(self) -> int:
         return len(self.place)
@@ -116,6 +123,11 @@ class EdgeFit:
     spot_m: float
     scatter: float
     lost_share: float
+
+
+def usual_spot(range_m: float) -> float:
+    """What spots of LiDARs have at a distance, as a standard deviation, metres; known to a factor of two."""
+    return 0.25 * (_SPOT_AT_START_M + _SPOT_WIDENS * range_m)
 
 
 def signed_distance(beams: EdgeBeams, centre: FloatArray, radius: FloatArray | float) -> tuple[FloatArray, FloatArray]:
@@ -278,7 +290,7 @@ def fit_edge(
     samples, inflation = _explore(problem, shape, np.full(3, 0.3 * reach), seed)
     covariance = np.cov(samples[:, :3].T) * np.sqrt(np.outer(inflation, inflation))
     if not tells_threshold(beams):
-        covariance[2, 2] += threshold_variance(stretch)
+        covariance[2, 2] += threshold_variance(beams, stretch)
     mean = samples[:, :3].mean(axis=0)
     spot, scatter = np.exp(np.median(samples[:, 3:5], axis=0))
     lost = float(np.median(_logistic(samples[:, 5])))
@@ -291,8 +303,8 @@ _SLOPE_SIGMA = 0.01
 
 def fit_straight_edge(
     beams: EdgeBeams, offset: float, *, dropout: float, reach: float, seed: int = 0
-) -> tuple[float, float]:
-    """Where a straight edge lies along the first axis of the plane, at zero along the second, and its variance, m^2.
+) -> tuple[float, float, float]:
+    """Where a straight edge lies along the first axis of the plane, at zero along the second; its variance, m^2; spot.
 
     The material is on the side of smaller first coordinates; the edge runs along the second axis, nearly. Otherwise as
     `fit_edge`.
@@ -308,21 +320,21 @@ def fit_straight_edge(
     samples, inflation = _explore(problem, np.array([offset, 0.0, 0.0]), off, seed)
     variance = float(np.var(samples[:, 0]) * inflation[0])
     if not tells_threshold(beams):
-        variance += threshold_variance(stretch)
-    return float(samples[:, 0].mean()), variance
+        variance += threshold_variance(beams, stretch)
+    return float(samples[:, 0].mean()), variance, float(np.exp(np.median(samples[:, 3])))
 
 
 def tells_threshold(beams: EdgeBeams) -> bool:
     """True if anything tells where the threshold of detection lies in the spot: mixed ranges, or the light of hits."""
-    return bool(np.any(~beams.open)) or beams.light is not None
+    return (beams.mixing_seen and bool(np.any(~beams.open))) or beams.light is not None
 
 
-def threshold_variance(stretch: FloatArray) -> float:
+def threshold_variance(beams: EdgeBeams, stretch: FloatArray) -> float:
     """Variance of an edge of hits and misses where the prior alone bounds spot and threshold, m^2.
 
     Sampling such a ridge is slow; its variance is known, that of threshold times spot.
     """
-    return float(_USUAL_SPOT_M**2 * np.exp(2.0 * _SPOT_SPREAD**2) * np.mean(stretch**2))
+    return float(beams.usual_spot_m**2 * np.exp(2.0 * _SPOT_SPREAD**2) * np.mean(stretch**2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -355,7 +367,7 @@ class _Problem:
         """Which of the ten parameters the data can tell; the others stay at their usual values."""
         beams = self.beams
         bounded, open_ = bool(np.any(~beams.open)), bool(np.any(beams.open))
-        spot = tells_threshold(beams)
+        spot = bounded or beams.light is not None
         lost = bool(np.any(~beams.open & ~np.isfinite(beams.depth)))
         # Without mixed ranges nothing tells of what they are made.
         mixed = bounded and self.mixed() >= _FEW_MIXED
@@ -371,7 +383,7 @@ class _Problem:
 
 # Shape (centre x, y, radius; or offset, slope), log spot, log scatter, share of mixed lost (as the logarithm of its
 # odds), threshold, log contrast, evenness of the spot, share of mixed pixels that lie anywhere (likewise).
-_USUAL = np.array([0.0, 0.0, 0.0, np.log(_USUAL_SPOT_M), np.log(0.03), -12.0, 0.0, 0.0, 0.5, -12.0])
+_USUAL = np.array([0.0, 0.0, 0.0, np.log(0.25 * _SPOT_AT_START_M), np.log(0.03), -12.0, 0.0, 0.0, 0.5, -12.0])
 # The search first sees depths blurred by this, then by less and less, so that no side valley holds it.
 _BLUR, _SHARPEN = 0.1, 0.2
 # Kinds of spot (see `_share`), which a larger blur hides; one that is worse by so much is not tried again.
@@ -396,7 +408,7 @@ def _explore(problem: _Problem, shape: FloatArray, off: FloatArray, seed: int) -
     rng = np.random.default_rng(seed)
     active = problem.active()
     usual = _USUAL.copy()
-    usual[:3], usual[8] = shape, _KINDS[0]
+    usual[:3], usual[3], usual[8] = shape, np.log(problem.beams.usual_spot_m), _KINDS[0]
     start = _start(shape, off, problem.reach, rng)[:, active]
     walkers = anneal(_posterior(problem.blurred(_BLUR), active, usual), start, rng)
     if active[3]:
@@ -499,6 +511,7 @@ def _posterior(problem: _Problem, active: BoolArray, usual: FloatArray) -> LogDe
     data = _sorted(problem.beams, problem.stretch, problem.reach, problem.straight)
     low = np.log([SMALLEST_SPOT_M, _SMALLEST_SCATTER])
     high = np.log([LARGEST_SPOT_M, _LARGEST_SCATTER])
+    log_spot = np.log(problem.beams.usual_spot_m)
 
     def density(some: FloatArray) -> FloatArray:
         x = _completed(some, active, usual)
@@ -506,7 +519,7 @@ def _posterior(problem: _Problem, active: BoolArray, usual: FloatArray) -> LogDe
         ok = np.isfinite(shape)
         value = np.full(len(x), -np.inf)
         if ok.any():
-            prior = -0.5 * ((x[ok, 3] - np.log(_USUAL_SPOT_M)) / _SPOT_SPREAD) ** 2
+            prior = -0.5 * ((x[ok, 3] - log_spot) / _SPOT_SPREAD) ** 2
             # Soft walls, as the likeliest scatter is often none: a top at a hard wall has no derivatives.
             beyond = np.maximum(low - x[ok, 3:5], 0.0) + np.maximum(x[ok, 3:5] - high, 0.0)
             prior -= 0.5 * ((beyond / _WALL) ** 2).sum(axis=1)
