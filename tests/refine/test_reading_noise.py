@@ -9,7 +9,7 @@ import pytest
 
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.model.observation import TurntableObservations
-from lidarpose.refine.joint_equations import all_moments, linearise, lines_of
+from lidarpose.refine.joint_equations import linearise, lines_of
 from lidarpose.refine.joint_options import JointOptions
 from lidarpose.refine.reading_noise import _errors, _turns
 from lidarpose.refine.turntable import refine_turntable
@@ -58,8 +58,7 @@ def test_a_reading_that_is_off_moves_residuals_as_reckoned() -> None:
 def test_the_errors_are_integrated_out_as_generalised_least_squares_does() -> None:
     rig = draw_rig(1, places=8)
     solution = _solved(rig, _observed(rig, np.deg2rad(0.05) * np.random.default_rng(1).standard_normal(8), seed=0))
-    moments = all_moments(solution.data, solution.at, solution.noise)
-    errors = _errors(solution, solution.noise, moments, _turns(solution))
+    errors = _errors(solution, solution.noise, _turns(solution), solution.equations, solution.covariance)
     use, variance = solution.active, np.deg2rad(0.03) ** 2
     found = errors.integrated_out(variance)
     # All parameters and the errors side by side, with the errors' prior: the parameters' part of the inverse.

@@ -14,7 +14,7 @@ import numpy as np
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray, IntArray
 from lidarpose.model.turntable_result import Kind
-from lidarpose.refine.joint_equations import all_moments, lines_of, reduced_moments
+from lidarpose.refine.joint_equations import lines_of, reduced_moments
 from lidarpose.refine.least_squares import NormalEquations
 from lidarpose.refine.turntable_joint import Solution
 from lidarpose.refine.turntable_parameters import N_GLOBAL
@@ -73,10 +73,9 @@ class _LineTerms:
 
 def line_terms(solution: Solution) -> _LineTerms:
     """All lines' normal equations; left-out lines contribute nothing."""
-    data = solution.data
-    moments = all_moments(data, solution.at, solution.noise)
     parts = [
-        _terms_of_kind(solution, kind, reduced_moments(m, solution.noise.lines[kind])) for kind, m in moments.items()
+        _terms_of_kind(solution, kind, reduced_moments(m, solution.noise.lines[kind]))
+        for kind, m in solution.moments.items()
     ]
     return _LineTerms(
         np.concatenate([p.place for p in parts]),

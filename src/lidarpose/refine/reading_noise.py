@@ -15,9 +15,7 @@ import numpy as np
 from lidarpose.geometry.arrays import FloatArray
 from lidarpose.geometry.robust import chi2_tail
 from lidarpose.refine.joint_equations import (
-    Moments,
     Noise,
-    all_moments,
     linearise,
     lines_of,
     normal_equations,
@@ -98,15 +96,14 @@ class _Errors:
 
 def reading_noise(solution: Solution) -> ReadingNoise | None:
     """Errors of the readings from place to place; None where the residuals show none."""
-    moments = all_moments(solution.data, solution.at, solution.noise)
     turns, noise = _turns(solution), solution.noise
-    errors = _errors(solution, noise, moments, turns)
+    errors = _errors(solution, noise, turns, solution.equations, solution.covariance)
     if not errors.significant():
         return None
     variance = errors.variance()
     for _ in range(_ROUNDS):
-        noise = _own_effects(solution, noise, moments, turns, errors, variance)
-        errors = _errors(solution, noise, moments, turns)
+        noise = _own_effects(solution, noise, turns, errors, variance)
+        errors = _errors(solution, noise, turns, *_equations(solution, noise))
         variance = errors.variance()
     if variance == 0.0:
         return None
@@ -141,14 +138,20 @@ def _turns(solution: Solution) -> FloatArray:
     return np.asarray(np.linalg.solve(J_place[:, :, :6], np.tile(axis[:, None], (len(J_place), 1, 1)))[:, :, 0])
 
 
-def _errors(solution: Solution, noise: Noise, moments: Moments, turns: FloatArray) -> _Errors:
+def _equations(solution: Solution, noise: Noise) -> tuple[NormalEquations, FloatArray]:
+    """At another noise of whole lines: the equations, and the covariance of the active parameters."""
+    equations = normal_equations(solution.data, solution.at, noise, solution.moments)
+    return equations, covariance_and_condition(equations.information[np.ix_(solution.active, solution.active)])[0]
+
+
+def _errors(
+    solution: Solution, noise: Noise, turns: FloatArray, equations: NormalEquations, covariance: FloatArray
+) -> _Errors:
     data, use = solution.data, np.asarray(solution.active)
-    equations = normal_equations(data, solution.at, noise, moments)
-    covariance, _, _ = covariance_and_condition(equations.information[np.ix_(use, use)])
     places, n = len(data.angles_rad), N_GLOBAL + 6 * len(data.slots)
     own, score, cross = np.zeros(places), np.zeros(places), np.zeros((places, n))
     for kind, residuals in solution.at.lines.items():
-        lines, reduced = lines_of(data, kind), reduced_moments(moments[kind], noise.lines[kind])
+        lines, reduced = lines_of(data, kind), reduced_moments(solution.moments[kind], noise.lines[kind])
         by_error = (residuals.to_parameters[:, :, :6] @ turns[lines.place][:, :, None])[:, :, 0]
         pull = (by_error[:, None, :] @ reduced[:, :-1, :])[:, 0, :]
         to = (pull[:, None, :-1] @ residuals.to_parameters)[:, 0, :]
@@ -164,11 +167,9 @@ def _errors(solution: Solution, noise: Noise, moments: Moments, turns: FloatArra
     return _Errors(own, score, cross, equations, covariance, values[told], vectors[:, told], along)
 
 
-def _own_effects(
-    solution: Solution, noise: Noise, moments: Moments, turns: FloatArray, errors: _Errors, variance: float
-) -> Noise:
+def _own_effects(solution: Solution, noise: Noise, turns: FloatArray, errors: _Errors, variance: float) -> Noise:
     """The noise with what lines are off by on their own, once the readings' errors are taken from them."""
-    data, use = solution.data, np.asarray(solution.active)
+    data, use, moments = solution.data, np.asarray(solution.active), solution.moments
     predicted = errors.predicted(variance)
     n = N_GLOBAL + 6 * len(data.slots)
     step, covariance = np.zeros(n), np.zeros((n, n))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.geometry.arrays import BoolArray, FloatArray
-from lidarpose.refine.joint_equations import Moments, all_moments, lines_of, reduced_moments
+from lidarpose.refine.joint_equations import Moments, lines_of, reduced_moments
 from lidarpose.refine.least_squares import add_lines, covariance_and_condition
 from lidarpose.refine.turntable_estimate import OutsideParameters
 from lidarpose.refine.turntable_joint import Solution
@@ -38,8 +38,7 @@ def leave_places_out(solution: Solution, outside: OutsideParameters, parts: int 
     order = np.argsort(data.angles_rad, kind="stable")
     if len(order) < 5:
         return None
-    moments = all_moments(data, solution.at, solution.noise)
-    reduced = {kind: reduced_moments(moments[kind], solution.noise.lines[kind]) for kind in moments}
+    reduced = {kind: reduced_moments(m, solution.noise.lines[kind]) for kind, m in solution.moments.items()}
     to_motion = motion_map(solution.state, outside.motion, data.reference_rad)
     to_pose = outside.motion.pose_jacobian(data.reference_rad) @ to_motion
     worst: Stability | None = None

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -89,6 +90,11 @@ class Solution:
     @property
     def state(self) -> JointState:
         return self.at.state
+
+    @cached_property
+    def moments(self) -> Moments:
+        """Of all lines, at the estimate."""
+        return all_moments(self.data, self.at, self.noise)
 
 
 def solve_joint(data: JointData, start: JointState, options: JointOptions) -> Solution:
