@@ -1,5 +1,7 @@
 """The edge's posterior against sampling, on beams drawn without any simulator of scenes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -53,6 +55,21 @@ def test_hits_and_misses_state_what_the_threshold_may_make() -> None:
         fit = fit_edge(sharp, np.array([2e-4, 1e-4]), RADIUS + 1e-3, inside=True, dropout=1e-4, reach=STEP)
         assert abs(fit.radius - RADIUS - beyond * spot_m) < 2e-4
         assert abs(fit.radius - RADIUS) < 1.5 * np.sqrt(fit.covariance[2, 2]) < 0.01
+
+
+def test_a_spot_of_another_kind_widens_sigma() -> None:
+    """Square spots of even light, which the model does not have: the beams' number does not average that out."""
+    rng = np.random.default_rng(6)
+    some = beams(rng, 0.0005)
+    offset = some.place[:, None] + 0.0012 * np.stack(np.meshgrid(*[np.linspace(-1, 1, 21)] * 2), -1).reshape(-1, 2)
+    F = (np.linalg.norm(offset, axis=-1) < RADIUS).mean(axis=1)
+    square = replace(some, depth=1.0 - F + rng.normal(0.0, 0.002, len(F)))
+    sigmas = []
+    for each in (some, square):
+        fit = fit_edge(each, np.zeros(2), RADIUS, inside=True, dropout=1e-4, reach=STEP)
+        sigmas.append(np.sqrt(fit.covariance[2, 2]))
+        assert abs(fit.radius - RADIUS) < 2.5 * sigmas[-1]
+    assert sigmas[1] > 3.0 * sigmas[0]
 
 
 def test_a_straight_edge() -> None:

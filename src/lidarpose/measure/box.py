@@ -211,9 +211,12 @@ def _edge(
     seed: int,
 ) -> BoxEdge:
     first, second = (_end(sign * axis, faces, others, sigma, seed) for sign in (1.0, -1.0))
+    sigmas = float(np.sqrt(first.variance)), float(np.sqrt(second.variance))
+    # Borders at both ends are seen with the same spot, and err together.
+    shared = first.by == second.by == "border"
     return BoxEdge(
         first.position + second.position,
-        float(np.sqrt(first.variance + second.variance)),
+        sum(sigmas) if shared else float(np.hypot(*sigmas)),
         None,
         axis,
         (first.by, second.by),
@@ -238,7 +241,9 @@ def _end(direction: FloatArray, faces: list[_Face], others: list[_Face], sigma: 
         # Two borders that disagree are both worse than they say.
         parts = [b.support.borders[0] for b in borders]
         shares = tuple((part[0], part[1], float(w / weights.sum())) for part, w in zip(parts, weights, strict=True))
-        variance = max(1.0, chi2 / max(1, len(borders) - 1)) / float(weights.sum())
+        # The spot is the same at both, so that their mean is no better than they are.
+        mean_sigma = float(weights @ [np.sqrt(b.variance) for b in borders] / weights.sum())
+        variance = max(1.0, chi2 / max(1, len(borders) - 1)) * mean_sigma**2
         return _End(position, variance, "border", EndSupport(None, borders=shares))
     support = _support(direction, along, others)
     if support is not None:

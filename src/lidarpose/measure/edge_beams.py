@@ -206,10 +206,14 @@ def _backgrounds(
     around = reference[neighbours]
     excess = view.excess[around]
     behind = excess > 5.0 * noise
+    # The nearest beams that see something else than most of them (a face beside, a mixed range) tell nothing of it.
+    far_off = np.abs(excess - _median_of(excess, behind))
+    odd = behind & (far_off > 4.0 * np.maximum(1.4826 * _median_of(far_off, behind), noise))
     share_none = (~np.isfinite(excess)).mean(axis=1)
     blocked = (np.isfinite(excess) & ~behind).sum(axis=1) >= 2
     offset = view.place[around] - view.place[near][:, None]
     design = np.concatenate([np.ones((*behind.shape, 1)), offset / view.step], axis=-1)
+    behind &= ~odd
     weight = behind.astype(float)
     normal = np.einsum("nki,nk,nkj->nij", design, weight, design) + 1e-3 * np.diag([0.0, 1.0, 1.0])
     normal += np.where(behind.any(axis=1), 0.0, 1.0)[:, None, None] * np.eye(3)
@@ -235,3 +239,11 @@ def _backgrounds(
     # Something returned from behind where nothing else does: no edge of this disk.
     usable &= ~(open_ & (view.excess[near] > 5.0 * noise))
     return usable, open_ | clutter, depth, sigma
+
+
+def _median_of(values: FloatArray, chosen: BoolArray) -> FloatArray:
+    """Medians (n, 1) of the chosen values of rows (n, k); 0 where none is chosen."""
+    ordered = np.sort(np.where(chosen, values, np.inf), axis=1)
+    count = chosen.sum(axis=1)
+    middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[:, None] // 2, axis=1)
+    return np.where(np.isfinite(middle), middle, 0.0)

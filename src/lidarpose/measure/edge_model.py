@@ -35,6 +35,8 @@ _SMALLEST_SCATTER, _LARGEST_SCATTER = 1e-5, 2.0
 # Softness of these bounds, as a logarithm.
 _WALL = 0.3
 _OUTLIERS = 0.01
+# Where in a spot beams on two surfaces are lost may differ by this, in standard deviations of the spot.
+_LOST_ASIDE = 0.5
 # Softness of the edge of what is detected, in distances between beams.
 _SOFTNESS = 0.02
 # The prior of the logarithm of the background's brightness over the material's.
@@ -289,8 +291,7 @@ def fit_edge(
     problem = _Problem(beams, stretch, reach, False, inside, dropout, round_prior)
     samples, inflation = _explore(problem, shape, np.full(3, 0.3 * reach), seed)
     covariance = np.cov(samples[:, :3].T) * np.sqrt(np.outer(inflation, inflation))
-    if not tells_threshold(beams):
-        covariance[2, 2] += threshold_variance(beams, stretch)
+    covariance[2, 2] += _common_variance(beams, stretch, samples)
     mean = samples[:, :3].mean(axis=0)
     spot, scatter = np.exp(np.median(samples[:, 3:5], axis=0))
     lost = float(np.median(_logistic(samples[:, 5])))
@@ -319,14 +320,28 @@ def fit_straight_edge(
     off = np.array([0.3 * reach, 0.5 * _SLOPE_SIGMA, 0.0])
     samples, inflation = _explore(problem, np.array([offset, 0.0, 0.0]), off, seed)
     variance = float(np.var(samples[:, 0]) * inflation[0])
-    if not tells_threshold(beams):
-        variance += threshold_variance(beams, stretch)
+    variance += _common_variance(beams, stretch, samples)
     return float(samples[:, 0].mean()), variance, float(np.exp(np.median(samples[:, 3])))
 
 
 def tells_threshold(beams: EdgeBeams) -> bool:
     """True if anything tells where the threshold of detection lies in the spot: mixed ranges, or the light of hits."""
     return (beams.mixing_seen and bool(np.any(~beams.open))) or beams.light is not None
+
+
+def _common_variance(beams: EdgeBeams, stretch: FloatArray, samples: FloatArray) -> float:
+    """Variance of an edge from what all beams share, and no number of them averages out, m^2.
+
+    Where mixed ranges or light tell of the spot: what they scatter beyond the noise comes from a spot that the model
+    does not have, alike in all beams. A share that is off by d moves the edge by sqrt(2 pi) d of the spot.
+    """
+    if not tells_threshold(beams):
+        return threshold_variance(beams, stretch)
+    spot, scatter = np.exp(np.median(samples[:, 3:5], axis=0))
+    # Beams that are lost need not be lost evenly on both sides.
+    lost = float(np.median(_logistic(samples[:, 5])))
+    square = 2.0 * np.pi * 0.25 * scatter + (_LOST_ASIDE * lost) ** 2
+    return float(square * spot**2 * np.mean(stretch**2))
 
 
 def threshold_variance(beams: EdgeBeams, stretch: FloatArray) -> float:
