@@ -112,6 +112,8 @@ def sight_again(
     *,
     seed: int = 0,
     part_at: int | None = None,
+    missing_m: float = MAX_MISSING_M,
+    held: bool = False,
 ) -> list[CornerCandidate] | None:
     """The reference's target near given spots at some places.
 
@@ -140,7 +142,7 @@ def sight_again(
         for p, c in zip(places, corners, strict=True)
     ]
     for local, corner in zip(close, corners, strict=True):
-        here = _planes(local, reference, edges, corner)
+        here = (_held_planes if held else _planes)(local, reference, edges, corner)
         if here is None:
             return None
         planes.append(here)
@@ -153,7 +155,7 @@ def sight_again(
         reference, edges = whole, _Edges.of(whole)
     found = []
     for local, here, corner in zip(places, planes, corners, strict=True):
-        sighting = _sighting(local, here, standing, reference, edges, corner)
+        sighting = _sighting(local, here, standing, reference, edges, corner, missing_m)
         if sighting is None:
             return None
         found.append(sighting)
@@ -198,17 +200,18 @@ def _sighting(
     reference: CornerCandidate,
     edges: _Edges,
     corner: FloatArray,
+    missing_m: float,
 ) -> CornerCandidate | None:
     own = _meeting(planes)
     if pays(0.0, KERNELS):
-        return _sighting_compiled(local, own, [*planes, *standing], reference, edges, corner)
+        return _sighting_compiled(local, own, [*planes, *standing], reference, edges, corner, missing_m)
     everything, local = local, _about(local, reference, own, AROUND_M)
     shown = _over_outlines(local, reference, edges, own, BORDER_M)
     patches = _shared_out(local, [*planes, *standing], shown, reference.sigma_m)
     if min(len(patch) for patch in patches[:3]) < FEWEST:
         return None
     bordering = tuple(patch for patch in patches[3:] if len(patch) >= FEWEST)
-    found = corner_of_faces(local, (*patches[:3], *bordering))
+    found = corner_of_faces(local, (*patches[:3], *bordering), missing_m)
     if found is None or found.convex != reference.convex or np.linalg.norm(found.corner - corner) > NEAR_M:
         return None
     return found if _is_in_view(everything, found, reference, edges) else None
@@ -221,12 +224,13 @@ def _sighting_compiled(
     reference: CornerCandidate,
     edges: _Edges,
     corner: FloatArray,
+    missing_m: float,
 ) -> CornerCandidate | None:
     """`_sighting` by kernels, the target's own corner known."""
     from lidarpose.detect.sighting_kernels import faces_seen, in_view
 
     rows = np.array([[*plane.normal, plane.offset] for plane in planes])
-    lengths = np.array([AROUND_M, BORDER_M, REACH_M, MAX_MISSING_M, GATE_SIGMAS * reference.sigma_m])
+    lengths = np.array([AROUND_M, BORDER_M, REACH_M, missing_m, GATE_SIGMAS * reference.sigma_m])
     side, outlines, sizes, counts, spreads, borders = faces_seen(
         local,
         own,
@@ -310,6 +314,20 @@ def _planes(local: FloatArray, reference: CornerCandidate, edges: _Edges, corner
                 return None
             planes.append(plane)
     return planes if len(planes) == 3 and np.linalg.norm(_meeting(planes) - corner) < NEAR_M else None
+
+
+def _held_planes(
+    local: FloatArray, reference: CornerCandidate, edges: _Edges, corner: FloatArray
+) -> list[Plane] | None:
+    """`_planes` with the reference's own normals: each where most of what lies over its outline is."""
+    planes = []
+    columns = np.ascontiguousarray(local.T)
+    for k, normal in enumerate(reference.normals):
+        chosen, height = _over_outline(columns, reference, edges, k, corner, NEAR_M)
+        if len(chosen) < FEWEST:
+            return None
+        planes.append(Plane(normal, float(normal @ corner) + _mode(height, 4.0 * reference.sigma_m)))
+    return planes if np.linalg.norm(_meeting(planes) - corner) < NEAR_M else None
 
 
 def _over_outlines(

@@ -82,15 +82,18 @@ def find_corners(
     return _without_doubles(sorted(found, key=lambda c: -c.support))
 
 
-def corner_of_faces(points: NDArray[np.floating], patches: tuple[PlanePatch, ...]) -> CornerCandidate | None:
-    """The corner of the first three of the patches (see `find_corners`), the others being what may border them."""
+def corner_of_faces(
+    points: NDArray[np.floating], patches: tuple[PlanePatch, ...], missing_m: float = MAX_MISSING_M
+) -> CornerCandidate | None:
+    """The corner of the first three of the patches (see `find_corners`), the others being what may border them; of no
+    face may more be missing next to the corner."""
     surfaces = [_Surface(p, points[p.indices].astype(np.float64)) for p in patches]
     faces = [p.plane for p in patches[:3]]
     try:
         corner = intersect_three_planes((faces[0], faces[1], faces[2]))
     except ValueError:
         return None
-    return _candidate(surfaces, np.arange(3), corner)
+    return _candidate(surfaces, np.arange(3), corner, missing_m)
 
 
 def _meeting_triples(surfaces: list[_Surface]) -> tuple[IntArray, FloatArray]:
@@ -110,11 +113,13 @@ def _meeting_triples(surfaces: list[_Surface]) -> tuple[IntArray, FloatArray]:
     return triples[inside], np.asarray(corners[inside])
 
 
-def _candidate(surfaces: list[_Surface], triple: IntArray, corner: FloatArray) -> CornerCandidate | None:
+def _candidate(
+    surfaces: list[_Surface], triple: IntArray, corner: FloatArray, missing_m: float = MAX_MISSING_M
+) -> CornerCandidate | None:
     faces = [surfaces[k].patch for k in triple]
     points = [surfaces[k].points for k in triple]
     compiled = pays(SAVED_S_PER_CORNER, KERNELS)
-    met = _met_compiled(points, faces, corner) if compiled else _met(points, faces, corner)
+    met = (_met_compiled if compiled else _met)(points, faces, corner, missing_m)
     if met is None or min(len(p) for p in met[1]) < MIN_FACE_POINTS:
         return None
     convex, local = met
@@ -133,7 +138,9 @@ def _candidate(surfaces: list[_Surface], triple: IntArray, corner: FloatArray) -
     )
 
 
-def _met(points: list[FloatArray], faces: list[PlanePatch], corner: FloatArray) -> tuple[bool, list[FloatArray]] | None:
+def _met(
+    points: list[FloatArray], faces: list[PlanePatch], corner: FloatArray, missing_m: float
+) -> tuple[bool, list[FloatArray]] | None:
     """Whether the edges of three faces are convex, and which of their points are next to the corner; None if these
     faces make none."""
     local, distances = [], []
@@ -141,7 +148,7 @@ def _met(points: list[FloatArray], faces: list[PlanePatch], corner: FloatArray) 
         offset = around - corner
         distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
         near = np.flatnonzero(distance < REACH_M)
-        if len(near) < MIN_FACE_POINTS or distance.min() > MAX_MISSING_M:
+        if len(near) < MIN_FACE_POINTS or distance.min() > missing_m:
             return None
         local.append(around.take(near, axis=0))
         distances.append(distance[near])
@@ -158,7 +165,7 @@ def _met(points: list[FloatArray], faces: list[PlanePatch], corner: FloatArray) 
 
 
 def _met_compiled(
-    points: list[FloatArray], faces: list[PlanePatch], corner: FloatArray
+    points: list[FloatArray], faces: list[PlanePatch], corner: FloatArray, missing_m: float
 ) -> tuple[bool, list[FloatArray]] | None:
     """`_met` by kernels."""
     from lidarpose.detect.sighting_kernels import faces_of_corner
@@ -169,7 +176,7 @@ def _met_compiled(
     tolerance = 3.0 * np.maximum(sigmas, sigmas[:, None])
     everyone = np.concatenate(points)
     side, keep = faces_of_corner(
-        everyone, starts, corner, planes, tolerance, REACH_M, MAX_MISSING_M, MIN_FACE_POINTS, ONE_SIDED
+        everyone, starts, corner, planes, tolerance, REACH_M, missing_m, MIN_FACE_POINTS, ONE_SIDED
     )
     if side < 0:
         return None

@@ -46,7 +46,7 @@ class CornerEvidence:
     what the residuals cannot tell; `scatter` is that of the spots, where it is known. `wrong` is the place whose world
     coordinates alone may be wrong, `possible` a crossing of the beams that the data leave open, `shape` what faces are
     off planes by; all are in that covariance. `turntable_unknown`: clouds have the errors of a turntable whose
-    calibration states none.
+    calibration states none. `doubt` is why the target itself may be another, empty if it cannot.
     """
 
     positions: tuple[str, ...]
@@ -66,6 +66,7 @@ class CornerEvidence:
     possible: OpenCrossing | None = None
     turntable_unknown: bool = False
     shape: FaceShape | None = None
+    doubt: str = ""
 
 
 @dataclass(frozen=True)
@@ -248,6 +249,8 @@ def _judge_common(
 ) -> None:
     if evidence.oddity:
         verdict.reject(evidence.oddity)
+    if evidence.doubt:
+        verdict.doubt(evidence.doubt)
     for item in evidence.left_out:
         if "," not in item.what and ":" not in item.what:
             verdict.doubt(f"{item.what} is left out: {item.reason}")

@@ -22,6 +22,7 @@ from lidarpose.geometry.threads import each
 from lidarpose.model.corner_result import CornerCandidate, CornerPlaceFaces, FaceReturns
 from lidarpose.model.corner_session import NEAR_RADIUS_M, CornerPlace, CornerSession, look_at_points
 from lidarpose.model.observation import LeftOut
+from lidarpose.model.plane_patch import PlanePatch
 from lidarpose.refine.face_screening import without_foreign_spots
 from lidarpose.refine.free_corner import FreeCorner, fit_corner
 from lidarpose.solve.corner_matching import (
@@ -34,6 +35,7 @@ from lidarpose.solve.corner_matching import (
     nearest_strays,
 )
 from lidarpose.workflows.moving_target import MIN_FACE_RETURNS, find_by_motion, load_points
+from lidarpose.workflows.seen_once import SeenPlace, seen_elsewhere
 
 # A hint is right within 0.3 m, and a target no larger than this beyond the corner.
 HINT_CROP_M = 1.5
@@ -45,6 +47,12 @@ LOOKS = 4
 NOISY_LOOKS, NOISY_LOOKS_AT_MANY, MANY_PLACES = 2, 1, 5
 # Where they fail, so many frames of a place at most, and points, are looked at together.
 STACKED_FRAMES, STACKED_POINTS = 20, 300_000
+SEEN_ONCE = (
+    "few places show the target whole, and at the others two of its faces and its distance have told where it is: "
+    "record it so that all three faces are seen up to the corner at each place"
+)
+# Corners farther apart than that are two.
+APART_M = 0.1
 GATE_SIGMAS = 6.5
 FIRST_GATE_M = 0.05
 # The share of a face next to the corner on which the first fit stands, before its far edges are trusted.
@@ -78,6 +86,8 @@ class FoundTarget:
         The sightings are of two faces; the third's normal is but the direction of their edge.
     by_motion
         Each sighting's planes were fitted at its place to all that a frame has of the faces; none is turned far.
+    doubt
+        Why this may be another corner, for the user; empty if it cannot.
     """
 
     sightings: tuple[CornerCandidate | None, ...]
@@ -88,6 +98,7 @@ class FoundTarget:
     strays: Mapping[int, str] = field(default_factory=dict)
     by_edges: bool = False
     by_motion: bool = False
+    doubt: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,9 +231,10 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
         matches, world, oddity = _match_with_mistakes(candidates, world_coordinates(session), session.estimate_scale)
     if not matches:
         by_edges = _find_by_edges(session, seed)
-        if by_edges is None:
+        found = by_edges or _find_seen_once(session, candidates, seed)
+        if found is None:
             raise _not_found(session, candidates)
-        return by_edges
+        return found
     return _found(session, candidates, matches, world, oddity)
 
 
@@ -235,6 +247,51 @@ def _find_by_edges(session: CornerSession, seed: int) -> FoundTarget | None:
     if not matches or matches[0].places < max(3, len(world) - 1):
         return None
     return replace(_found(session, candidates, matches, world, ""), by_edges=True)
+
+
+def _find_seen_once(
+    session: CornerSession, candidates: Sequence[Sequence[CornerCandidate]], seed: int
+) -> FoundTarget | None:
+    """The target by what one place shows of it, if it stands so at most of the others, as the coordinates say."""
+    world = world_coordinates(session)
+    range_sigma_m = session.lidar.range_sigma_m
+    places = [_seen(place, here, range_sigma_m, seed) for place, here in zip(session.places, candidates, strict=True)]
+    followed = [
+        [_near_it(place, here) for place, here in zip(session.places, everywhere, strict=True)]
+        for everywhere in seen_elsewhere(places, world)
+    ]
+    found = [(match, sightings) for sightings in followed for match in match_corners(sightings, world)]
+    # Fewer than half of the places may fit by chance.
+    if not found or 2 * max(match.places for match, _ in found) <= len(world):
+        return None
+    found.sort(key=lambda one: (-one[0].places, one[0].rms_m))
+    target = _found(session, found[0][1], [match for match, _ in found], world, "")
+    return replace(target, ambiguous=target.ambiguous or _is_outdone(target, followed), doubt=SEEN_ONCE)
+
+
+def _is_outdone(target: FoundTarget, followed: Sequence[Sequence[Sequence[CornerCandidate]]]) -> bool:
+    """Whether another corner, seen better than the target, is found elsewhere too: it may be the target's, hidden at
+    the other places, and this one of something that was moved with it."""
+    corners = expected_corners(target)
+    support = max(s.support for s in target.sightings if s is not None)
+    for rival in followed:
+        seen = [
+            (min(here, key=lambda c: float(np.linalg.norm(c.corner - corner))), corner)
+            for here, corner in zip(rival, corners, strict=True)
+            if here
+        ]
+        apart = [float(np.linalg.norm(c.corner - corner)) for c, corner in seen]
+        if len(seen) > 1 and max(c.support for c, _ in seen) > support and min(apart) > APART_M:
+            return True
+    return False
+
+
+def _seen(place: CornerPlace, corners: Sequence[CornerCandidate], range_sigma_m: float | None, seed: int) -> SeenPlace:
+    first = _near_hint(load_points(place.clouds[0]), place)
+    plain = segment_planes(first, PlaneSearch(min_points=FEWEST_FACE_RETURNS, from_sensor=True, seed=seed))
+    points, patches = _stacked(place, range_sigma_m, seed)
+    # Frames are stacked with the first one first.
+    return SeenPlace.of(points, (*plain, *patches), corners)
 
 
 def _edges_at(place: CornerPlace, seed: int) -> tuple[CornerCandidate, ...]:
@@ -293,12 +350,22 @@ def place_corners(
 def noisy_corners(place: CornerPlace, range_sigma_m: float | None, seed: int = 0) -> tuple[CornerCandidate, ...]:
     """All corners at a place, or those near the hint, whose faces are noisy beside their size, or have but few returns
     in a frame: all frames are looked at together."""
+    points, patches = _stacked(place, range_sigma_m, seed)
+    return find_corners(points, patches, place.near, NEAR_RADIUS_M)
+
+
+def _stacked(place: CornerPlace, range_sigma_m: float | None, seed: int) -> tuple[FloatArray, tuple[PlanePatch, ...]]:
+    """The points (N, 3) of up to `STACKED_FRAMES` frames of a place, and their patches."""
     first = _near_hint(load_points(place.clouds[0]), place)
     count = int(np.clip(STACKED_POINTS // max(len(first), 1), 1, min(STACKED_FRAMES, len(place.clouds))))
     others = np.linspace(0, len(place.clouds) - 1, count).round().astype(int)[1:].tolist()
     points = np.concatenate([first, *(_near_hint(load_points(place.clouds[k]), place) for k in others)])
-    patches = segment_noisy_planes(points, range_sigma_m=range_sigma_m, min_points=FEWEST_FACE_RETURNS, seed=seed)
-    return find_corners(points, patches, place.near, NEAR_RADIUS_M)
+    return points, segment_noisy_planes(points, range_sigma_m=range_sigma_m, min_points=FEWEST_FACE_RETURNS, seed=seed)
+
+
+def _near_it(place: CornerPlace, corners: Sequence[CornerCandidate]) -> list[CornerCandidate]:
+    """Those of the corners that are near the place's hint, if it has one."""
+    return [c for c in corners if place.near is None or np.linalg.norm(c.corner - place.near) <= NEAR_RADIUS_M]
 
 
 def _near_hint(points: FloatArray, place: CornerPlace) -> FloatArray:
@@ -319,7 +386,7 @@ def _is_ambiguous(matches: Sequence[CornerMatch], world: FloatArray) -> bool:
     corners = best.T_world_lidar.inverse() @ world
     for other in matches[1:]:
         apart = np.linalg.norm(other.T_world_lidar.inverse() @ world - corners, axis=1)
-        if other.places == best.places and np.median(apart) > 0.1 and other.rms_m < 3.0 * best.rms_m + 0.005:
+        if other.places == best.places and np.median(apart) > APART_M and other.rms_m < 3.0 * best.rms_m + 0.005:
             return True
     return False
 

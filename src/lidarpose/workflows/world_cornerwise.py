@@ -69,6 +69,7 @@ def cornerwise(
         session.lidar.range_sigma_m,
         session.cloud_frame,
         {m.position: m.scatter for m in means},
+        doubt=found.doubt,
     )
     quality = judge_corners(pose, w, scale * p, covariance, evidence, limits)
     calibration = WorldCalibration(

@@ -248,6 +248,7 @@ def _judged(
         beside.possible,
         share is None and holds_scans(session),
         shape,
+        doubt=found.doubt,
     )
     quality = judge_corner_fit(fit, used, evidence, limits)
     covariance = fit.covariance * float(quality.figures["covariance_factor"])
