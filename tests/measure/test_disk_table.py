@@ -67,8 +67,7 @@ def test_ten_disks_with_a_calibration_from_a_session(tmp_path: Path) -> None:
         outermost_mm.append(1e3 * (disk.outermost_diameter_m - scene.diameter_m))
     assert np.abs(errors_mm).mean() <= 0.05
     assert abs(np.mean(errors_mm)) <= 0.03
-    # What bundles of 91 rays scatter is stated as if all beams shared it: sigma is up to three times the errors.
-    assert 0.2 < np.sqrt(np.mean(np.square(standardised))) < 2.0
+    assert 0.4 < np.sqrt(np.mean(np.square(standardised))) < 2.0
     # The paper's way: some millimetres small, with little scatter.
     assert np.mean(outermost_mm) < -3.0
 
@@ -76,7 +75,7 @@ def test_ten_disks_with_a_calibration_from_a_session(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("mixing", "mean_mm", "bias_mm"), [("mean", 0.02, 0.008), ("random", 0.06, 0.03)])
 def test_errors_over_their_stated_sigma(mixing: Mixing, mean_mm: float, bias_mm: float) -> None:
-    """Thirty disks at random, with the true calibration: the stated sigma holds the errors."""
+    """Thirty disks at random, with the true calibration: the stated standard deviation is what the errors have."""
     motion, errors_mm, standardised = rig_motion(), [], []
     for seed in range(30):
         rng = np.random.default_rng(1000 + seed)
@@ -93,6 +92,5 @@ def test_errors_over_their_stated_sigma(mixing: Mixing, mean_mm: float, bias_mm:
         standardised.append((disk.diameter_m - scene.diameter_m) / disk.sigma_m)
     assert np.abs(errors_mm).mean() < mean_mm
     assert abs(np.mean(errors_mm)) < bias_mm
-    # Of thirty errors over true standard deviations the root mean square scatters by 0.13. What bundles of 91 rays
-    # scatter is stated as if all beams shared it.
-    assert 0.2 < np.sqrt(np.mean(np.square(standardised))) < 1.35
+    # Of thirty errors over true standard deviations the root mean square scatters by 0.13.
+    assert 0.7 < np.sqrt(np.mean(np.square(standardised))) < 1.35

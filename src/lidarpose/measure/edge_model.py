@@ -37,6 +37,9 @@ _WALL = 0.3
 _OUTLIERS = 0.01
 # Where in a spot beams on two surfaces are lost may differ by this, in standard deviations of the spot.
 _LOST_ASIDE = 0.5
+# How many parts of a spot a cut's place is told apart by, to so many standard deviations of the spot on both sides; and
+# what chance makes of their means.
+_CUTS, _CUT_REACH, _CUT_SIGMAS = 10, 2.5, 2.0
 # Softness of the edge of what is detected, in distances between beams.
 _SOFTNESS = 0.02
 # The prior of the logarithm of the background's brightness over the material's.
@@ -291,7 +294,7 @@ def fit_edge(
     problem = _Problem(beams, stretch, reach, False, inside, dropout, round_prior)
     samples, inflation = _explore(problem, shape, np.full(3, 0.3 * reach), seed)
     covariance = np.cov(samples[:, :3].T) * np.sqrt(np.outer(inflation, inflation))
-    covariance[2, 2] += _common_variance(beams, stretch, samples)
+    covariance[2, 2] += _common_variance(problem, samples)
     mean = samples[:, :3].mean(axis=0)
     spot, scatter = np.exp(np.median(samples[:, 3:5], axis=0))
     lost = float(np.median(_logistic(samples[:, 5])))
@@ -320,7 +323,7 @@ def fit_straight_edge(
     off = np.array([0.3 * reach, 0.5 * _SLOPE_SIGMA, 0.0])
     samples, inflation = _explore(problem, np.array([offset, 0.0, 0.0]), off, seed)
     variance = float(np.var(samples[:, 0]) * inflation[0])
-    variance += _common_variance(beams, stretch, samples)
+    variance += _common_variance(problem, samples)
     return float(samples[:, 0].mean()), variance, float(np.exp(np.median(samples[:, 3])))
 
 
@@ -329,19 +332,44 @@ def tells_threshold(beams: EdgeBeams) -> bool:
     return (beams.mixing_seen and bool(np.any(~beams.open))) or beams.light is not None
 
 
-def _common_variance(beams: EdgeBeams, stretch: FloatArray, samples: FloatArray) -> float:
+def _common_variance(problem: _Problem, samples: FloatArray) -> float:
     """Variance of an edge from what all beams share, and no number of them averages out, m^2.
 
-    Where mixed ranges or light tell of the spot: what they scatter beyond the noise comes from a spot that the model
-    does not have, alike in all beams. A share that is off by d moves the edge by sqrt(2 pi) d of the spot.
+    Where mixed ranges or light tell of the spot: depths that are off alike wherever a spot is cut alike come from a
+    spot that the model does not have. A share that is off by d moves the edge by sqrt(2 pi) d of the spot.
     """
+    beams, stretch = problem.beams, problem.stretch
     if not tells_threshold(beams):
         return threshold_variance(beams, stretch)
-    spot, scatter = np.exp(np.median(samples[:, 3:5], axis=0))
+    x = np.median(samples, axis=0)
     # Beams that are lost need not be lost evenly on both sides.
-    lost = float(np.median(_logistic(samples[:, 5])))
-    square = 2.0 * np.pi * 0.25 * scatter + (_LOST_ASIDE * lost) ** 2
-    return float(square * spot**2 * np.mean(stretch**2))
+    square = 2.0 * np.pi * _misfit_of_share(problem, x) + (_LOST_ASIDE * float(_logistic(x[5]))) ** 2
+    return float(square * np.exp(2.0 * x[3]) * np.mean(stretch**2))
+
+
+def _misfit_of_share(problem: _Problem, x: FloatArray) -> float:
+    """Variance of what depths are off by at x (10,), as a function of how the spot is cut.
+
+    Zero where noise explains it. By moments (DerSimonian and Laird, 1986), of means over parts of the spot.
+    """
+    data = _sorted(problem.beams, problem.stretch, problem.reach, problem.straight)
+    _, u = _distances(x[None], data)
+    F = _share(-u if problem.inside else u, x[None, 8, None])[0, : data.ends[0]]
+    share = F / (F + np.exp(x[7]) * (1.0 - F))
+    excess = np.exp(x[4]) * 0.25 * np.sqrt(_both(u[0, : data.ends[0]]))
+    variance = share * data.near_variance + (1.0 - share) * data.far_variance + excess
+    residual = data.depth - 1.0 + share
+    part = np.floor((u[0, : data.ends[0]] + _CUT_REACH) * (_CUTS / (2.0 * _CUT_REACH)))
+    chosen = (part >= 0) & (part < _CUTS) & (residual**2 < 16.0 * variance)
+    part, residual, weight = part[chosen].astype(np.int64), residual[chosen], 1.0 / variance[chosen]
+    weights = np.bincount(part, weight, _CUTS)
+    sums = np.bincount(part, weight * residual, _CUTS)
+    there = weights > 0.0
+    count = np.count_nonzero(there)
+    found = float((sums[there] ** 2 / weights[there]).sum()) - count
+    if count < 2 or found < _CUT_SIGMAS * np.sqrt(2.0 * count):
+        return 0.0
+    return found / float(weights.sum() - (weights**2).sum() / weights.sum())
 
 
 def threshold_variance(beams: EdgeBeams, stretch: FloatArray) -> float:
