@@ -134,7 +134,9 @@ _FRAMES_COMMAND = (
 )
 _FRAMES = (
     "Kernels are what a process that runs on has; a single run takes NumPy's way and does not wait for them. "
-    "Parts of both ways, and what no way can leave out, are measured beside the whole. Before the last fit, whose"
+    "Parts of both ways, and what no way can leave out, are measured beside the whole. By NumPy that alone is 2.6 "
+    "times reading, above 2; by kernels it is 1.8, and the least that finding takes 0.1: 3 ms are left of 2 for the "
+    "corner's search at six places, evidence and verdict, which take 50 ms. Before the last fit, whose"
     " two passes over all returns take half a millisecond each by kernels, the estimate takes one that serves "
     "each frame's corner, a step of the estimate and its noise, and one along the faces' sides; about two fifths "
     "of its time goes into evidence (foreign spots, sides of faces, rings, where beams cross), in many small "
