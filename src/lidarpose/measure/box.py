@@ -135,8 +135,9 @@ def measure_box(beams: Beams, sigma: float, *, seed: int = 0) -> BoxMeasurement:
         If no two faces meet at a right angle, pointing outward, or an end of an edge is not seen.
     """
     faces = [f for p in find_patches(beams.points, sigma) if (f := _face(beams, p, sigma)) is not None]
-    chosen = _box_faces(faces, sigma)
-    others = [f for f in faces if f not in chosen]
+    found = _box_faces(faces, sigma)
+    others = [f for f in faces if f not in found]
+    chosen = _apart(beams, _apart(beams, found, sigma), sigma)
     axes: list[tuple[FloatArray, tuple[FaceSupport, ...]]] = [(f.normal, (f.support,)) for f in chosen]
     if len(axes) == 2:
         axes.append((unit(np.cross(axes[0][0], axes[1][0])), (axes[0][1][0], axes[1][1][0])))
@@ -147,8 +148,24 @@ def measure_box(beams: Beams, sigma: float, *, seed: int = 0) -> BoxMeasurement:
     return BoxMeasurement(tuple(edges), normals, tuple(f.patch.count for f in chosen), tuple(angles))
 
 
-def _face(beams: Beams, patch: Patch, sigma: float) -> _Face | None:
+def _apart(beams: Beams, faces: list[_Face], sigma: float) -> list[_Face]:
+    """The faces, each fitted anew without beams that end beyond an edge, on the next face.
+
+    Noise lets a patch reach over; such beams lie behind the plane, all of them, and would draw it away from the LiDAR.
+    """
+    again = []
+    for face in faces:
+        view = face.view
+        points = view.frame[0] + view.place @ view.frame[1:]
+        inside = np.all([f.offset - points @ f.normal > 2.0 * view.step for f in faces if f is not face], axis=0)
+        again.append(_face(beams, face.patch, sigma, inside.reshape(face.patch.mask.shape)) or face)
+    return again
+
+
+def _face(beams: Beams, patch: Patch, sigma: float, chosen: BoolArray | None = None) -> _Face | None:
     inner = ndimage.binary_erosion(patch.mask, iterations=2, border_value=0)
+    if chosen is not None:
+        inner &= chosen
     if np.count_nonzero(inner) < 30:
         return None
     try:
