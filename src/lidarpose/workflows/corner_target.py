@@ -223,8 +223,8 @@ def find_target(session: CornerSession, *, seed: int = 0, tick: Tick = lambda: N
             candidates[k] += place_corners(place, seed + attempt, frame, FEWEST_FACE_RETURNS)
         matches, world, oddity = _match_with_mistakes(candidates, world_coordinates(session), session.estimate_scale)
     for attempt in range(NOISY_LOOKS if len(world) < MANY_PLACES else NOISY_LOOKS_AT_MANY):
-        # Fewer than half of the places may fit by chance; where more do, those left add nothing but time.
-        if matches and 2 * matches[0].places >= len(world):
+        # Fewer than half of the places may fit by chance, and three of four; where more do, those left add but time.
+        if matches and matches[0].places >= max(0.5 * len(world), min(len(world), 5)):
             break
         for k, place in enumerate(session.places):
             candidates[k] += noisy_corners(place, session.lidar.range_sigma_m, seed + attempt)

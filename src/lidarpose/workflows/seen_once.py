@@ -26,6 +26,8 @@ MOST_CORNERS, SAME_M = 8, 0.05
 HIDDEN_M = 0.6
 # Planes have an edge where they are turned against one another by more than this.
 LEAST_SINE = 0.3
+# Noise makes a target of what is no target where a face's own place is known no better than this.
+KNOWN_M = 0.003
 # Spots nearer to one another are looked at once.
 SAME_SPOT_M = 0.03
 
@@ -102,7 +104,9 @@ def _sighted(place: SeenPlace, corner: CornerCandidate, apart_m: float) -> list[
     found = []
     for spot in _spots(place, corner, apart_m):
         seen = _stands(place, corner, spot)
-        if seen is not None and abs(float(np.linalg.norm(seen.corner - corner.corner)) - apart_m) < TOLERANCE_M:
+        if seen is None or seen.sigma_m > KNOWN_M * np.sqrt(seen.support):
+            continue
+        if abs(float(np.linalg.norm(seen.corner - corner.corner)) - apart_m) < TOLERANCE_M:
             found.append(seen)
     return found
 
